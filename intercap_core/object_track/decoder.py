@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import logsumexp
@@ -35,10 +34,6 @@ MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second; t
 JUMP_COST = 10.0  # of a step that no motion explains, nats; tuned
 VANISH_COST = 7.0  # of going out of sight, and of coming into sight, nats; tuned
 LEAVE_COST = 4.0  # of leaving the room or coming back, in addition, nats; tuned
-# Cost of a step to a place that the object cannot reach between two sure frames, and of the step
-# back: about log 100, since the reachable part of a room is a hundredth.
-EXCURSION_COST = 5.0  # nats; tuned
-REACH_M = 0.2  # tolerance of distances between reachable poses, for their errors, metres; tuned
 
 FIRST_HAND = 2  # first mode that is a hand, after rest and free motion
 HIDDEN = -1  # index in paths: no hypothesis is true
@@ -139,56 +134,6 @@ def pose_distances(
         poses[:, :3, :3] @ mesh.centre_of_mass + poses[:, :3, 3] for poses in (before, after)
     )
     return turn, np.linalg.norm(there[None] - here[:, None], axis=-1)
-
-
-def find_excursions(
-    centres: Sequence[np.ndarray], path: np.ndarray, sure: np.ndarray, times: np.ndarray
-) -> list[np.ndarray]:
-    """Find hypotheses that the object cannot reach between the sure frames before and after.
-
-    A hypothesis is out of reach if it is too far from either of the two. If the two cannot be
-    reached from each other, nothing is out of reach.
-
-    Args:
-        centres: [T] (K_t, 3) of the hypotheses, metres.
-        path: (T,) chosen hypothesis of each frame.
-        sure: (T,) frames whose choice is sure.
-        times: (T,) seconds.
-
-    Returns:
-        [T] (K_t,) bool, true if out of reach.
-    """
-
-    def reaches(a: np.ndarray, b: np.ndarray, seconds: float) -> np.ndarray:
-        return np.linalg.norm(a - b, axis=-1) < REACH_M + 4.0 * seconds  # m/s: it is thrown
-
-    known = np.flatnonzero(sure).tolist()
-    places = np.array([centres[t][path[t]] for t in known]).reshape(-1, 3)
-    away = [np.zeros(len(own), bool) for own in centres]
-    for i, (u, v) in enumerate(pairwise(known)):
-        if v > u + 1 and reaches(places[i], places[i + 1], times[v] - times[u]):
-            for t in range(u + 1, v):
-                away[t] = ~(
-                    reaches(centres[t], places[i], times[t] - times[u])
-                    & reaches(centres[t], places[i + 1], times[v] - times[t])
-                )
-    return away
-
-
-def add_excursion_costs(
-    steps: Sequence[np.ndarray], away: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Add :data:`EXCURSION_COST` to steps from and to hypotheses that are out of reach.
-
-    Args:
-        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) log-probabilities.
-        away: [T] (K_t,) of :func:`find_excursions`.
-    """
-    result = []
-    for step, (before, after) in zip(steps, pairwise(away), strict=True):
-        out, back = np.append(before, False), np.append(after, False)
-        result.append(step - EXCURSION_COST * (out[:, None] != back))
-    return result
 
 
 @dataclass(frozen=True)

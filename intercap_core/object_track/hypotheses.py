@@ -13,10 +13,8 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.decoder import (
-    EXCURSION_COST,
     HIDDEN,
     JUMP_COST,
-    REACH_M,
     Decoded,
     pose_distances,
 )
@@ -38,10 +36,12 @@ MAX_HYPOTHESES = 12  # tuned on the studio
 RIVAL_PROBABILITY = 0.01  # hypotheses below this probability are not considered further; tuned
 RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not followed, nats; tuned
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
-# Evidence that an annotated pose adds in its frame: for this pose, and for all poses within REACH_M
-# of it. The latter outweighs the cost of a jump there and back for that frame alone.
+# Poses within this distance of an annotated pose may show the annotated object.
+ANNOTATED_REACH_M = 0.2  # metres; tuned
+# Evidence that an annotated pose adds in its frame: for this pose, and for all poses within
+# ANNOTATED_REACH_M. The latter outweighs a jump there and back for that frame alone.
 ANNOTATION_LOG_RATIO = 10.0  # nats; tuned
-ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
+ANNOTATED_LOG_RATIO = 3 * JUMP_COST
 
 
 class Prior:
@@ -94,7 +94,7 @@ class Prior:
             _, shift = pose_distances(mesh, self.given[t].pose[None], poses)
             squared = self.given[t].squared_distances(mesh, poses)
             near = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
-            result += (ANNOTATED_LOG_RATIO * (shift[0] < REACH_M) + near) / share
+            result += (ANNOTATED_LOG_RATIO * (shift[0] < ANNOTATED_REACH_M) + near) / share
         return result
 
 

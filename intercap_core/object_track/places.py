@@ -18,18 +18,14 @@ from intercap_core.object_track.groups import find_groups, locate_group
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
 from intercap_core.object_track.view import View
 
-# Shares of the surveyed frames in which a place is occupied: above the first by an object that
-# never leaves it, below the second by one that moves.
-ALWAYS_PRESENT = 0.85  # tuned
+# A place that is occupied in a smaller share of the surveyed frames is that of a moving object.
 SOMETIMES_PRESENT = 0.5  # tuned
 MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time; tuned
 MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time; tuned
-UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against a moving object with nobody near; tuned
-# A place that is occupied in this many frames while the object is elsewhere holds another object.
-RIVAL_FRAMES = 2  # tuned
-# Largest reduction of the evidence in a place where a similar object was seen while the tracked one
-# was elsewhere. It is limited, because the track may have mistaken one for the other.
-CLUTTER_LOG_RATIO = 10.0  # nats; tuned
+# Largest evidence of a frame, nats, against a place that probably shows another object: nobody is
+# near, or a similar object was seen there while the tracked one was elsewhere. It is limited,
+# because the track may have mistaken one for the other.
+OTHER_OBJECT_LOG_RATIO = 10.0  # tuned
 
 
 @dataclass(eq=False)
@@ -103,23 +99,25 @@ class Places:
         """Return the prior, 0.1 to 1, that the tracked object is at ``place`` (3,) in frame t.
 
         Away from known places it is ``MOVED_PRIOR``, or more near the person. In a known place it
-        is that of the whole recording, or ``MIN_PLACE_PRIOR`` if another object stands there.
+        is that of the whole recording, or ``MIN_PLACE_PRIOR`` if another object stands there: the
+        place was occupied in at least two frames while the tracked object was elsewhere.
         """
         nearest = self._nearest(place)
         if nearest is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
         standing, place_prior = nearest
-        return MIN_PLACE_PRIOR if len(standing.rival_frames) >= RIVAL_FRAMES else place_prior
+        return MIN_PLACE_PRIOR if len(standing.rival_frames) >= 2 else place_prior
 
     def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
         """Combine the images' evidence for the object at ``place`` (3,) in frame t with its prior.
 
         1. In an excluded place the images count only against the object, and the place costs
-           ``CLUTTER_LOG_RATIO``. Elsewhere the evidence of a similar object there is subtracted.
+           ``OTHER_OBJECT_LOG_RATIO``. Elsewhere the evidence of a similar object there is
+           subtracted.
         2. In a place that is occupied for most of the recording, the result is at most the log odds
            of the prior: another object of the class looks like the tracked one.
-        3. Elsewhere the object moves: up to ``UNHANDLED_LOG_RATIO`` is subtracted if the person is
-           not near.
+        3. Elsewhere the object moves: up to ``OTHER_OBJECT_LOG_RATIO`` is subtracted if the person
+           is not near.
 
         Args:
             t: frame.
@@ -131,12 +129,12 @@ class Places:
             Log-likelihood ratio with the prior, nats.
         """
         if self._index(self._others, place) is not None:
-            return min(ratio, 0.0) - CLUTTER_LOG_RATIO
+            return min(ratio, 0.0) - OTHER_OBJECT_LOG_RATIO
         ratio -= self._clutter_ratio(place)
         nearest = self._nearest(place)
         if nearest is None or nearest[0].share < SOMETIMES_PRESENT:
             gaps = self._gaps(place, slice(t, t + 1))
-            return ratio - (UNHANDLED_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
+            return ratio - (OTHER_OBJECT_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
         prior = min(self.prior(t, place), 1 - 1e-6)
         return min(ratio, float(np.log(prior / (1 - prior))) / share)
 
@@ -205,12 +203,12 @@ class Places:
     def _clutter_ratio(self, place: np.ndarray) -> float:
         """Return the evidence, nats, of a similar object that stays at ``place`` (3,).
 
-        It is no evidence for the tracked object there.
+        It is no evidence for the tracked object there. An object that was seen once does not count.
         """
         clutter = self._clutter_at(place)
-        if clutter is None or len(clutter[1]) < RIVAL_FRAMES:
+        if clutter is None or len(clutter[1]) < 2:
             return 0.0
-        return min(float(np.mean(list(clutter[1].values()))), CLUTTER_LOG_RATIO)
+        return min(float(np.mean(list(clutter[1].values()))), OTHER_OBJECT_LOG_RATIO)
 
     def _standing_prior(self, standing: OccupiedPlace) -> float:
         """Return the prior of a known place over the recording.
@@ -218,9 +216,8 @@ class Places:
         It is high if the person comes near, or if the place was vacant for a part of the time.
         """
         handled = _closeness(self._gaps(standing.place, slice(None)))
-        left = MOVED_PRIOR * min(
-            (ALWAYS_PRESENT - standing.share) / (ALWAYS_PRESENT - SOMETIMES_PRESENT), 1.0
-        )
+        always = 0.85  # share of the frames in which an object is seen that never leaves; tuned
+        left = MOVED_PRIOR * min((always - standing.share) / (always - SOMETIMES_PRESENT), 1.0)
         return max(handled, left, MIN_PLACE_PRIOR)
 
     def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:

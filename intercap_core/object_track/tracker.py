@@ -22,16 +22,18 @@ from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.decoder import (
     FREE_COST_S,
     HIDDEN,
-    REACH_M,
     Decoded,
-    add_excursion_costs,
     decode,
-    find_excursions,
     step_log_ratios,
 )
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.hypotheses import Hypotheses, Prior, group_by_candidates
+from intercap_core.object_track.hypotheses import (
+    ANNOTATED_REACH_M,
+    Hypotheses,
+    Prior,
+    group_by_candidates,
+)
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.mesh_check import mesh_doubts
 from intercap_core.object_track.motion import estimate_hand_motions
@@ -169,26 +171,22 @@ class Tracker:
     def _decode(self) -> Decoded:
         """Decide between the hypotheses of all frames, and update the prior of places accordingly.
 
-        The model decides two or three times. First it uses the usual costs of motion. If the object
-        is hidden near an annotated pose, it then decides with free motion at no cost there. Last,
-        hypotheses that the object cannot reach from the nearest sure frames get an additional cost.
+        If the object is hidden near an annotated pose, the model decides a second time, with free
+        motion at no cost there.
         """
-        times, fits = self._observer.times, self._hypotheses.fits
+        fits = self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
-        steps = self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S))
+        self._steps = self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S))
         self._emissions = [self._observer.share * weight for weight in weights]
-        decoded = decode(self._emissions, steps, self._absent)
+        decoded = decode(self._emissions, self._steps, self._absent)
         # near annotated poses of a hidden object any motion is possible
         near = self._prior.near_annotated(decoded.path == HIDDEN)
         if near.any():
             free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
-            steps = self._step_log_ratios(poses, free)
-            decoded = decode(self._emissions, steps, self._absent)
+            self._steps = self._step_log_ratios(poses, free)
+            decoded = decode(self._emissions, self._steps, self._absent)
         centres = [np.array([self._mesh.centre_at(p) for p in own]).reshape(-1, 3) for own in poses]
-        away = find_excursions(centres, decoded.path, _sure_frames(decoded), times)
-        self._steps = add_excursion_costs(steps, away)
-        decoded = decode(self._emissions, self._steps, self._absent)
         self._update_places(decoded, centres)
         return decoded
 
@@ -226,7 +224,7 @@ class Tracker:
         number = group_by_candidates(fits)
         own = [number[k] for k, fit in enumerate(fits) if given.holds(self._mesh, fit.pose)]
         centre = self._mesh.centre_at(given.pose)
-        far = np.linalg.norm(centres - centre, axis=1) > REACH_M + self._mesh.diameter
+        far = np.linalg.norm(centres - centre, axis=1) > ANNOTATED_REACH_M + self._mesh.diameter
         for k, fit in enumerate(fits):
             if far[k] and number[k] not in own and fit.log_ratio > SEEN_LOG_RATIO:
                 self._observer.places.exclude(centres[k])

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.decoder import (
-    EXCURSION_COST,
     FREE_COST_S,
     HELD_M,
     HELD_M_S,
@@ -22,9 +21,7 @@ from intercap_core.object_track.decoder import (
     LEAVE_COST,
     MODE_CHANGES_S,
     STANDING_M,
-    add_excursion_costs,
     decode,
-    find_excursions,
     mode_log_ratios,
     step_log_ratios,
 )
@@ -212,23 +209,3 @@ def test_turns_of_a_symmetry_are_no_motion() -> None:
     bottle = ObjectMesh.load(catalogue()["bottle"])
     spun = step_log_ratios(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
     assert spun[0, 0, 0, 0] == pytest.approx(-np.log(2 - np.exp(-MODE_CHANGES_S / 15)))
-
-
-def test_excursions_between_sure_frames_cost_twice() -> None:
-    """At rest, hidden for three frames with clutter two metres away."""
-    there, clutter = np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]])
-    centres = [there, clutter, np.concatenate([there, clutter]), clutter, there]
-    times = np.arange(5) / 15
-    sure = np.array([True, False, False, False, True])
-    away = find_excursions(centres, np.array([0, 0, 0, 0, 0]), sure, times)
-    assert [own.tolist() for own in away] == [[False], [True], [False, True], [True], [False]]
-    steps = add_excursion_costs(
-        [np.zeros((1, 1, len(a) + 1, len(b) + 1)) for a, b in pairwise(centres)], away
-    )
-    assert steps[0][0, 0].tolist() == [[-EXCURSION_COST, 0], [-EXCURSION_COST, 0]]
-    assert steps[1][0, 0].tolist() == [
-        [-EXCURSION_COST, 0, -EXCURSION_COST],
-        [0, -EXCURSION_COST, 0],
-    ]
-    far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
-    assert not any(own.any() for own in find_excursions(far, np.zeros(5, int), sure, times))

@@ -21,8 +21,7 @@ from intercap_core.object_track.hypotheses import (
 )
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.places import (
-    CLUTTER_LOG_RATIO,
-    UNHANDLED_LOG_RATIO,
+    OTHER_OBJECT_LOG_RATIO,
     OccupiedPlace,
     Places,
 )
@@ -77,11 +76,11 @@ def test_an_excluded_place_is_never_the_object(bottle):
     places = Places(bottle, [], joints_at(HANDLED))
     assert places.weigh(3, HANDLED, 20.0, 0.2) == 20.0
     places.exclude(HANDLED + 0.01)
-    assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
-    assert places.weigh(3, HANDLED, -4.0, 0.2) == -4.0 - CLUTTER_LOG_RATIO
+    assert places.weigh(3, HANDLED, 20.0, 0.2) == -OTHER_OBJECT_LOG_RATIO
+    assert places.weigh(3, HANDLED, -4.0, 0.2) == -4.0 - OTHER_OBJECT_LOG_RATIO
     assert places.weigh(3, HANDLED + np.array([0, 0.3, 0]), 20.0, 0.2) > 0
     places.clear_rivals()
-    assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
+    assert places.weigh(3, HANDLED, 20.0, 0.2) == -OTHER_OBJECT_LOG_RATIO
 
 
 def test_a_place_occupied_meanwhile_is_another_object(bottle):
@@ -110,7 +109,7 @@ def test_evidence_of_clutter_is_subtracted(bottle):
     assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - 8.0)
     for t in (14, 15, 16):
         places.add_rival(t, APART, HANDLED, 50.0)  # may be a twin: it keeps most of its evidence
-    assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - CLUTTER_LOG_RATIO)
+    assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - OTHER_OBJECT_LOG_RATIO)
     assert places.weigh(3, HANDLED, 7.0, 0.2) == pytest.approx(elsewhere)
     places.clear_rivals()
     assert places.weigh(3, APART, 7.0, 0.2) == 7.0
@@ -149,7 +148,7 @@ def test_poses_of_one_candidate_differ_by_their_evidence(cup):
 
 def test_objects_that_move_far_from_everybody_need_evidence(cup):
     found = prior_of(cup).weigh(3, [fit_of(cup, AWAY, 30.0, 2)])
-    assert found[0] == pytest.approx(30.0 - 0.9 * UNHANDLED_LOG_RATIO)
+    assert found[0] == pytest.approx(30.0 - 0.9 * OTHER_OBJECT_LOG_RATIO)
 
 
 def test_upright_and_annotated_poses_weigh_more(cup):
