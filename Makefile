@@ -6,6 +6,7 @@
 # make chaos           runs that are killed, disks that are full, results that are damaged
 # make fuzz            damaged files of every kind that a user supplies
 # make lint            ruff, import-linter, snakefmt, mypy, snakemake --lint
+# make mediapipe       environment of a real keypoint detector, for make evaluate
 # make evaluate        all evaluation recordings against truth, into results/evaluation.json
 # make evaluate-quick  six recordings; fails if a figure is worse than bench/reference-quick.json
 # make bench           seconds per frame and memory, also of the paper's recipe
@@ -23,12 +24,13 @@ VENV ?= .venv
 CORES ?= 0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+MEDIAPIPE := .venv-mediapipe
 TORCH := torch==2.13.0
 EXTRAS := workflow,test,bench,dev
 RUN_TESTS = $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-fast test-all test-slurm lint ruff-check ruff-format imports snakefmt mypy \
-    snakemake-lint evaluate evaluate-quick bench ablation oracle annotate-driven report scale-report scale fuzz chaos \
+    snakemake-lint mediapipe evaluate evaluate-quick bench ablation oracle annotate-driven report scale-report scale fuzz chaos \
     docs environment clean
 
 demo: $(STAMP)
@@ -69,7 +71,19 @@ mypy: $(STAMP)
 snakemake-lint: $(STAMP)
 	$(BIN)/snakemake --lint --configfile config/demo/config.yaml
 
+# MediaPipe needs NumPy 1 and uses little of what it lists as required
+$(MEDIAPIPE)/.installed:
+	$(PYTHON) -m venv $(MEDIAPIPE)
+	$(MEDIAPIPE)/bin/pip install --quiet --no-deps mediapipe==0.10.21
+	$(MEDIAPIPE)/bin/pip install --quiet "numpy<2" "opencv-python-headless<4.12" absl-py attrs flatbuffers \
+	    "protobuf<5" matplotlib
+	touch $@
+
+mediapipe: $(MEDIAPIPE)/.installed
+
+# without MediaPipe (Python 3.13 and later), the area detector is left out
 evaluate: $(STAMP)
+	-$(MAKE) --no-print-directory mediapipe
 	$(BIN)/intercap evaluate --cores $(CORES)
 
 evaluate-quick: $(STAMP)

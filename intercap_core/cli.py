@@ -59,7 +59,9 @@ class ReleasedKind(StrEnum):
     artefact = "artefact"
 
 
-Part = Literal["sequences", "captures", "objects", "bodies", "field_scenes", "field"]
+Part = Literal[
+    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector"
+]  # fmt: skip
 WIDEST_HOLE = 0.1  # default limit, as a share of the object's length
 DEFAULT_SETTINGS = Path("config/config.yaml")
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
@@ -341,12 +343,16 @@ def evaluate(
         list[Path] | None,
         _evaluated("the metrics", "Projects with and without field conditions,"),
     ] = None,
+    detector: Annotated[
+        list[Path] | None,
+        _evaluated("the metrics", "Projects with keypoints of a real detector (make mediapipe),"),
+    ] = None,
     only: Annotated[
         Part | None,
         typer.Option(
-            help="Evaluate one part only: sequences and field up to the metrics, captures and "
-            "field_scenes up to the scene, objects up to the object track, bodies up to the body "
-            "fit."
+            help="Evaluate one part only: sequences, field and detector up to the metrics, "
+            "captures and field_scenes up to the scene, objects up to the object track, bodies up "
+            "to the body fit."
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
@@ -394,7 +400,7 @@ def evaluate(
         raise typer.Exit(status)
     parts = {
         "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
-        "field_scenes": field_scenes, "field": field,
+        "field_scenes": field_scenes, "field": field, "detector": detector,
     }  # fmt: skip
     chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))

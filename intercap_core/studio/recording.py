@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.capture_folder import CaptureFolder, Device, DeviceFrame
 from intercap_core.studio.keypoints import Detector, to_json
 from intercap_core.studio.masks import CameraMasks, Labels, MaskSimulator
+from intercap_core.studio.mediapipe import detect_keypoints
 from intercap_core.studio.passer_by import Passing
 from intercap_core.studio.render import (
     BODY,
@@ -128,7 +131,8 @@ class Kinect:
             self.has_depth, stage.fps // self.every, min(self.device_time_us(t) for t in self.sets),
             self._sound() if folder.capture.sound else None,
         )  # fmt: skip
-        with folder.open(device) as files:
+        real = folder.capture.keypoints == "mediapipe"
+        with TemporaryDirectory() as images, folder.open(device) as files:
             for order, t in enumerate(self.sets):
                 surfaces = surfaces_at(stage, moment, t, colours, passing)
                 cast = colour_view.cast(surfaces)
@@ -154,16 +158,21 @@ class Kinect:
                 results = masks.candidates(t, truth)
                 folder.add_masks(name, t, stage.fps, results, segmenter.label)
                 image = folder.image_number(t, order, stage.fps)
+                if real:
+                    (Path(images) / f"{image:012d}.jpg").write_bytes(jpeg)
                 candidates += [{"image_id": image, **result} for result in results]
+            if real:
+                detect_keypoints(Path(images), folder.path / "keypoints" / f"{name}.json")
         path = folder.path / "candidates" / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
-        shown = self._detected(detector, moment, points, hidden)
-        people = detector.people(self.true, shown)
-        if passing:
-            walker = self._detected(detector, passing, others, others_hidden, "passer-by")
-            people = detector.with_passer_by(self.true, people, walker, others_hidden)
-        self._write_keypoints(folder, people)
+        if not real:
+            shown = self._detected(detector, moment, points, hidden)
+            people = detector.people(self.true, shown)
+            if passing:
+                walker = self._detected(detector, passing, others, others_hidden, "passer-by")
+                people = detector.with_passer_by(self.true, people, walker, others_hidden)
+            self._write_keypoints(folder, people)
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return CameraRecord(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
@@ -176,11 +185,24 @@ class Kinect:
     def _views(self) -> tuple[RoomView, RoomView]:
         """Views of the room through the colour and through the depth lens."""
         assert self.true.depth is not None
-        colour_pose = invert(self.stage.rig.master_from_stage) @ self.true.master_from_colour
         return (
-            RoomView(self.true.colour, colour_pose, self.stage.room, coloured=True),
+            self._colour_view(coloured=True),
             RoomView(self.true.depth, self._depth_pose, self.stage.room, coloured=False),
         )
+
+    def _colour_view(self, *, coloured: bool) -> RoomView:
+        pose = invert(self.stage.rig.master_from_stage) @ self.true.master_from_colour
+        return RoomView(self.true.colour, pose, self.stage.room, coloured=coloured)
+
+    def occluded_keypoints(self, moment: StageState) -> np.ndarray:
+        """Mask (T, 135) of the subject's keypoints that a surface occludes in each image."""
+        view, points = self._colour_view(coloured=False), self.stage.keypoints(moment)
+        colours = np.zeros((len(self.stage.subject.rest), 3))
+        hidden = np.zeros(points.shape[:2], bool)
+        for t in self.sets:
+            cast = view.cast(surfaces_at(self.stage, moment, t, colours))
+            hidden[t] = _hidden(cast, view, points[t])
+        return hidden
 
     def _sound(self) -> np.ndarray:
         """Sound from the first image to the last."""

@@ -233,6 +233,11 @@ def check_capture(
             f"recordings of layout {layout!r} are no videos; take 'video' out or set layout: plain",
         ),
         (
+            capture.keypoints != "simulated" and layout not in ("k4a", "plain"),
+            f"keypoints in recordings of layout {layout!r} are simulated; take 'keypoints' out or "
+            "set layout: plain",
+        ),
+        (
             capture.sound and not capture.video,
             "only videos carry sound; take 'sound' out or set video: true and layout: plain",
         ),

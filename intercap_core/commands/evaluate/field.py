@@ -213,7 +213,7 @@ PART = EvaluationPart(
             "field", "no_depth", "builds", "shoes", "two_views", "alone", "beam", "passer_by"
         ),
     ),
-    budget_minutes=14,
+    budget_minutes=12.5,
     measure=measure,
     flat=flat,
     print_tables=print_field,

@@ -61,7 +61,7 @@ class EvaluationPart(Generic[Errors]):
     """Other stages whose artefacts are read."""
     settings: Sequence[Path]
     """Settings files that are evaluated by default."""
-    budget_minutes: int
+    budget_minutes: float
     """Minutes on two cores that the part may add to `make evaluate`, for its recordings and the
     stages that no earlier part computes. The sum of all parts must not exceed 60."""
     measure: Callable[[Project, str], Errors]

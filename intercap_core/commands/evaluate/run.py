@@ -13,6 +13,7 @@ from typing import Any
 from intercap_core.commands.evaluate import (
     bodies,
     captures,
+    detector,
     field,
     field_scenes,
     objects,
@@ -33,6 +34,7 @@ from intercap_core.commands.evaluate.workflows import (
 )
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
+from intercap_core.studio.mediapipe import mediapipe_python
 
 PARTS: dict[str, EvaluationPart[Any]] = {
     part.name: part
@@ -43,6 +45,7 @@ PARTS: dict[str, EvaluationPart[Any]] = {
         bodies.PART,
         field_scenes.PART,
         field.PART,
+        detector.PART,
     )
 }
 QUICK_SETTINGS = Path("config/evaluation/quick.yaml")
@@ -69,6 +72,9 @@ def evaluate(
         seed: draw everything random in the recordings from new seeds (:mod:`.seeds`).
     """
     begin = time.monotonic()
+    if mediapipe_python() is None and not chosen.get(detector.PART.name, True):
+        print("part detector is left out: MediaPipe is not installed; run 'make mediapipe'")
+        chosen = {name: paths for name, paths in chosen.items() if name != detector.PART.name}
     settings = {name: list(paths or PARTS[name].settings) for name, paths in chosen.items()}
     if seed is not None:
         settings = redraw_settings(settings, seed)

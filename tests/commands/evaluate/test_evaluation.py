@@ -40,7 +40,7 @@ def test_no_two_recordings_share_a_seed() -> None:
     objects = [path for path in PARTS["objects"].settings if path.stem not in of_config]
     others = [
         Path(f"config/{other}/config.yaml")
-        for other in ("demo", "test", "bench", "evaluation", "annotate")
+        for other in ("demo", "test", "bench", "evaluation", "annotate", "detector")
     ]
     others += [QUICK_SETTINGS, Path("config/evaluation/long.yaml")]
     others += sorted(Path("config/field").glob("*.yaml"))

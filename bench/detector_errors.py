@@ -1,0 +1,201 @@
+"""Errors of 2D keypoints against the truth of virtual recordings: a real or a simulated detector.
+
+    python -m bench.detector_errors SETTINGS [--sequences NAME ...]
+
+The true keypoints are projected at the true time of each image. Errors are converted to
+millimetres at the point's depth. Each group of points has one row:
+
+- ``seen``, ``hidden``: median error of visible points and of occluded ones.
+- ``constant``: median size of each point's mean error in a view over the recording.
+- ``1 frame``, ``0.5 s``: correlation of the remaining error over this time.
+- ``3D``: median error of the points triangulated with the true cameras.
+- ``stated``: median standard error that follows from the views' disagreement.
+- ``ratio``: root mean square of 3D error over ``stated``; 1.7 if errors of views are independent.
+- ``found``: share of the points that the detector reports, of those inside the image.
+- ``rank``: rank correlation of confidence and size of the error, -1 for an ideal confidence.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+from scipy.stats import spearmanr
+
+from bench.command import exit_on_user_error
+from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.commands.evaluate.part import console_of, number
+from intercap_core.errors import UserError
+from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.triangulation import reproject, spread, triangulate
+from intercap_core.project import Project, load_project
+from intercap_core.studio.recording import Kinect
+from intercap_core.studio.stage import StudioStage
+
+MAX_ERROR_PX = 40.0  # of a view that still counts as an inlier, 1080p; the default of stage person
+COLUMNS = ("seen", "hidden", "constant", "1 frame", "0.5 s", "3D", "stated", "ratio", "found",
+           "rank")  # fmt: skip
+DIGITS = (1, 1, 1, 2, 2, 1, 1, 1, 2, 2)
+
+
+def groups() -> dict[str, np.ndarray]:
+    """Indices of the keypoints of each row."""
+    names = np.array(KEYPOINT_NAMES[:25])
+
+    def ending(*words: str) -> np.ndarray:
+        return np.array([i for i, name in enumerate(names) if any(w in name for w in words)])
+
+    hand = np.arange(21)
+    tips, roots = hand[4::4], np.array([0, 5, 9, 13, 17])
+    other = np.setdiff1d(hand, [*tips, *roots])
+    both = {"wrist and knuckles": roots, "fingers": other, "fingertips": tips}
+    return {
+        "shoulders": ending("shoulder"),
+        "elbows": ending("elbow"),
+        "wrists": ending("wrist"),
+        "hips": ending("left_hip", "right_hip"),
+        "knees": ending("knee"),
+        "ankles": ending("ankle"),
+        "feet": ending("toe", "heel"),
+        **{f"hand: {name}": np.r_[25 + rows, 46 + rows] for name, rows in both.items()},
+        "face": np.arange(67, 135),
+    }
+
+
+@dataclass(frozen=True)
+class DetectorErrors:
+    """Errors of one recording: T sets, C cameras, 135 keypoints."""
+
+    error_mm: np.ndarray
+    """(T, C, 135, 2) detected minus true place at the point's depth; NaN = not detected."""
+    confidence: np.ndarray
+    """(T, C, 135)."""
+    hidden: np.ndarray
+    """(T, C, 135) bool."""
+    inside: np.ndarray
+    """(T, C, 135) bool: an image exists and contains the true point."""
+    space_mm: np.ndarray
+    """(T, 135) error of the triangulated point; NaN = none."""
+    stated_mm: np.ndarray
+    """(T, 135) standard error of one coordinate by the views' disagreement."""
+    fps: float
+
+
+def measure(project: Project, sequence: str) -> DetectorErrors:
+    """Compare the detections artefact with the true keypoints."""
+    studio = project.config.studio
+    if studio is None or sequence not in studio.captures:
+        raise UserError(f"{project.path}: sequence {sequence!r} is not made by the studio")
+    path = project.artefact(sequence, "detections")
+    if not path.is_file():
+        raise UserError(f"{path}: is missing; run the project to stage 'detections' first")
+    stage = StudioStage(studio.captures[sequence], studio, project.object_of(sequence))
+    rig, found = stage.rig.true, Detections.load(path)
+    shape = (stage.frames, len(rig), 135)
+    error, place = np.full((2, *shape, 2), np.nan)
+    confidence, hidden, inside = np.zeros(shape), np.zeros(shape, bool), np.zeros(shape, bool)
+    at_sets = stage.to_master(stage.keypoints(stage.at(stage.set_times)))
+    for c, camera in enumerate(rig):
+        kinect = Kinect(stage, c, studio.colour_mode)
+        moment = stage.at(kinect.exposures)
+        points = stage.keypoints(moment)
+        covered = kinect.occluded_keypoints(moment)
+        local = stage.to_master(points) @ camera.colour_from_master[:3, :3].T
+        local += camera.colour_from_master[:3, 3]
+        true = camera.colour.project(local)
+        size = 1e3 * local[..., 2:] / camera.colour.fx  # millimetres of a pixel
+        within = (true > 0).all(-1) & (true < (camera.colour.width, camera.colour.height)).all(-1)
+        expected = reproject(at_sets.reshape(-1, 3), Rig((camera,))).reshape(*at_sets.shape[:2], 2)
+        for t in kinect.sets:
+            inside[t, c], hidden[t, c] = within[t], covered[t]
+            people = found.people(t, c)
+            if not len(people):
+                continue
+            away = np.linalg.norm(people[:, :25, :2] - true[t, :25], axis=-1)
+            away[people[:, :25, 2] <= 0] = np.nan
+            person = people[np.nanargmin(np.nanmedian(away, 1))]
+            known = person[:, 2] > 0
+            confidence[t, c] = person[:, 2]
+            pixels = person[known, :2] - true[t, known]
+            error[t, c, known] = pixels * size[t, known]
+            place[t, c, known] = expected[t, known] + pixels
+    weights = np.where(np.isfinite(place[..., 0]), confidence, 0.0)
+    flat = np.moveaxis(np.nan_to_num(place), 1, 2).reshape(-1, len(rig), 2)
+    solved = triangulate(
+        flat, np.moveaxis(weights, 1, 2).reshape(-1, len(rig)), rig, max_error_px=MAX_ERROR_PX
+    )
+    space = np.linalg.norm(solved.points - at_sets.reshape(-1, 3), axis=1).reshape(shape[0], 135)
+    stated = spread(solved, rig).reshape(shape[0], 135)
+    return DetectorErrors(
+        error, confidence, hidden, inside, 1e3 * space, 1e3 * stated, float(stage.fps)
+    )
+
+
+def figures(recordings: list[DetectorErrors], points: np.ndarray) -> tuple[float, ...]:
+    """Figures of a group of ``points``, in the order of :data:`COLUMNS`."""
+    seen, hidden, constant = [], [], []
+    lags: tuple[list[tuple[np.ndarray, np.ndarray]], ...] = ([], [])
+    space, ratio, stated, reported, size, confidence = [], [], [], [], [], []
+    for r in recordings:
+        error = r.error_mm[:, :, points]
+        known, covered = np.isfinite(error[..., 0]), r.hidden[:, :, points]
+        seen.append(error[known & ~covered])
+        hidden.append(error[known & covered])
+        visible = np.where((known & ~covered)[..., None], np.clip(error, -100, 100), np.nan)
+        enough = np.isfinite(visible[..., 0]).sum(0) >= 0.5 * len(visible)
+        mean = np.nanmean(np.where(enough[..., None], visible, np.nan), axis=0)
+        constant.append(mean[enough])
+        rest = visible - mean
+        for store, lag in zip(lags, (1, max(1, round(0.5 * r.fps))), strict=True):
+            a, b = rest[lag:], rest[:-lag]
+            both = np.isfinite(a) & np.isfinite(b)
+            store.append((a[both], b[both]))
+        agreed = r.stated_mm[:, points] > 0
+        space.append(r.space_mm[:, points][agreed])
+        stated.append(r.stated_mm[:, points][agreed])
+        ratio.append(space[-1] / stated[-1])
+        reported.append(known[r.inside[:, :, points]])
+        size.append(np.linalg.norm(error[known], axis=-1))
+        confidence.append(r.confidence[:, :, points][known])
+
+    def median(values: list[np.ndarray]) -> float:
+        whole = np.linalg.norm(np.concatenate(values), axis=-1)
+        return float(np.median(whole)) if len(whole) else float("nan")
+
+    def correlation(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+        a, b = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 else float("nan")
+
+    whole = {name: np.concatenate(v) for name, v in dict(s=space, d=stated, r=ratio).items()}
+    rank = spearmanr(np.concatenate(confidence), np.concatenate(size)).statistic
+    return (
+        median(seen), median(hidden), median(constant), correlation(lags[0]), correlation(lags[1]),
+        float(np.median(whole["s"])), float(np.median(whole["d"])),
+        float(np.sqrt(np.mean(np.clip(whole["r"], 0, 10) ** 2))),
+        float(np.concatenate(reported).mean()), float(rank),
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Read the command line and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("settings", type=Path)
+    parser.add_argument("--sequences", nargs="+", default=())
+    options = parser.parse_args()
+    with exit_on_user_error():
+        project = load_project(options.settings)
+        names = list(options.sequences) or list(project.sequences)
+        recordings = [measure(project, name) for name in names]
+    table = Table("points", *COLUMNS, box=None, title=f"{options.settings}, mm")
+    for name, points in groups().items():
+        row = figures(recordings, points)
+        table.add_row(name, *(number(v, d) for v, d in zip(row, DIGITS, strict=True)))
+    console_of(110).print(table)
+
+
+if __name__ == "__main__":
+    main()

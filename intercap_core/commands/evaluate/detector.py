@@ -1,0 +1,155 @@
+"""Part ``detector`` of `intercap evaluate`: all stages with keypoints of a real detector.
+
+MediaPipe detects the keypoints in the studio's images (:mod:`intercap_core.studio.mediapipe`). Its
+errors last over frames and are shared by views, and hands that hold an object are often not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from intercap_core import artefacts
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.evaluate.part import (
+    EvaluationPart,
+    Figures,
+    Measured,
+    config_files,
+    console_of,
+    keyed,
+    number,
+    truth_of,
+    with_spread,
+)
+from intercap_core.commands.evaluate.sequences import areas
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.truth import match_times
+from intercap_core.project import Project
+from intercap_core.schemas import JOINT, METRIC_REGIONS, SCENE, TRUTH
+
+_WRISTS = [JOINT_INDEX["left_wrist"], JOINT_INDEX["right_wrist"]]
+# Figures of the area ``detector`` and their keys among those of part ``sequences``
+FIGURES = {
+    "object_translation_median_mm": ("joint", "object_translation_median_mm"),
+    "body_mpjpe_mm": ("joint", "body_mpjpe_mm"),
+    "hand_mpjpe_mm": ("joint", "hand_mpjpe_mm"),
+    "hand_grasp_mpjpe_mm": ("joint", "hand_grasp_mpjpe_mm"),
+    "fingertip_holding_mm": ("joint", "fingertip_touching_mm"),
+    "contact_detected_f1": ("joint", "contact_detected_f1"),
+    "extrinsics_scene_mm": ("extrinsics", "after_mean_mm"),
+    "extrinsics_joint_mm": ("extrinsics", "joint_mean_mm"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorSequence:
+    """Errors of one recording."""
+
+    metrics: SequenceMetrics
+    slip_m: list[float]
+    """Slip of each grip, see :func:`grip_slips`."""
+
+
+DetectorSequences = Measured[DetectorSequence]
+
+
+def measure(project: Project, sequence: str) -> DetectorSequence:
+    """Read the metrics of one recording and measure the slip of its grips."""
+    metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
+    paths, truth = project.paths(sequence), truth_of(project, sequence)
+    with artefacts.read(paths.scene, SCENE) as scene:
+        times = scene["times"]
+    return DetectorSequence(metrics, _slips_of(paths.joint, truth, times, metrics.fps))
+
+
+def _slips_of(joint: Path, truth: Path, times: np.ndarray, fps: float) -> list[float]:
+    with artefacts.read(joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
+        at = match_times(truth, true["times"], times, fps)
+        columns = [true.text("region_names").index(name) for name in METRIC_REGIONS[:2]]
+        return grip_slips(
+            _in_object(fitted["joints"], fitted["rotation"], fitted["translation"]),
+            _in_object(true["joints"][at], true["rotation"][at], true["translation"][at]),
+            true["region_contact"][at][:, columns],
+            fps,
+        )
+
+
+def _in_object(joints: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Wrists (T, 2, 3) in the object's frame, metres."""
+    return (joints[:, _WRISTS] - translation[:, None]) @ rotation
+
+
+def grip_slips(
+    wrists: np.ndarray, true_wrists: np.ndarray, holding: np.ndarray, fps: float
+) -> list[float]:
+    """Slip of each grip, metres: how far a wrist strays in the object's frame.
+
+    A grip is an interval of at least 0.3 s in which a hand truly touches. Its slip is the 95th
+    percentile of the distance of the wrist's error from the mean error of the grip. True slips are
+    therefore no errors.
+
+    Args:
+        wrists: (T, 2, 3) fitted wrists in the fitted object's frame, metres.
+        true_wrists: (T, 2, 3) true wrists in the true object's frame, metres.
+        holding: (T, 2) mask of true contact of the hands.
+        fps: frames per second.
+    """
+    found = []
+    for hand in range(2):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], holding[:, hand].astype(int), [0]])))
+        for first, end in edges.reshape(-1, 2):
+            if end - first >= 0.3 * fps:
+                error = (wrists - true_wrists)[first:end, hand]
+                stray = np.linalg.norm(error - error.mean(0), axis=1)
+                found.append(float(np.percentile(stray, 95)))
+    return found
+
+
+def figures(recordings: Sequence[DetectorSequence]) -> Figures:
+    """Figures of recordings; undefined ones are omitted."""
+    found = areas([recording.metrics for recording in recordings])
+    result = {name: found[area][key] for name, (area, key) in FIGURES.items() if key in found[area]}
+    slips = [slip for recording in recordings for slip in recording.slip_m]
+    if slips:
+        result["grip_slip_mm"] = 1e3 * float(np.mean(slips))
+    return result | {f"verdict_{key}": value for key, value in found["verdict"].items()}
+
+
+def flat(evaluations: Sequence[DetectorSequences]) -> Figures:
+    """Keys ``detector.<measure>``."""
+    return keyed("detector.", with_spread(figures, _every(evaluations)))
+
+
+def _every(evaluations: Sequence[DetectorSequences]) -> list[DetectorSequence]:
+    return [recording for found in evaluations for recording in found.errors]
+
+
+def print_table(evaluations: Sequence[DetectorSequences]) -> None:
+    """Print one row per recording, and one of all."""
+    columns = [*FIGURES, "grip_slip_mm"]
+    heads = [name.replace("_mm", " mm").replace("_", " ") for name in columns]
+    table = Table("recording", *heads, box=None, title="keypoints of MediaPipe, after joint")
+    every = _every(evaluations)
+    for name, some in [*((r.metrics.name, [r]) for r in every), ("all", every)]:
+        row = figures(some)
+        digits = (2 if "f1" in column else 1 for column in columns)
+        table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
+    console_of(160).print(table)
+    for name in (name for measured in evaluations for name in measured.missing):
+        print(f"{name}: no metrics")
+
+
+PART = EvaluationPart(
+    name="detector",
+    stage="metrics",
+    settings=config_files("detector", "config"),
+    budget_minutes=7,
+    measure=measure,
+    flat=flat,
+    print_tables=print_table,
+)
