@@ -37,9 +37,11 @@ from intercap_core.person.tracks import (
 )
 
 # The score of the person who touches the object most is multiplied by 1 + HANDLING_WEIGHT, that of
-# others in proportion to their contact. Untuned.
+# others in proportion to their contact. Not tuned: half of it reports the choice beside a second
+# person as doubtful (config/field/passer_by.yaml), double changes nothing there.
 HANDLING_WEIGHT = 4.0
-# Another person of at least this share of the subject's score is reported; untuned.
+# Another person of at least this share of the subject's score is reported. Not tuned: half of it
+# reports people beside the right subject (config/field/passer_by.yaml).
 RIVAL_SHARE = 0.5
 
 Touches = Callable[[int, int, int], bool | None]

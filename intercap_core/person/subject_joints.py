@@ -26,7 +26,8 @@ from intercap_core.person.left_right import find_mirrored, make_views_agree
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_everywhere, exchange_limb
 
 # Largest angular speed of a keypoint, rad/s: hands reach 5 m/s in everyday tasks, at two metres
-# from the cameras of a ring. Faster jumps in an image are wrong detections.
+# from the cameras of a ring. Faster jumps in an image are wrong detections. Between two known
+# neighbours limited_velocity limits a jump by itself; this limit serves gaps, and jumps in a row.
 MAX_IMAGE_SPEED_RAD_S = 2.5
 
 

@@ -23,9 +23,12 @@ from intercap_core.person.groups import PersonGroup
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
 MAX_BODY_SPEED_M_S = 4.0  # largest speed of a body's centre; people run slower indoors; untuned
 # Longest gap over which position alone identifies a person: for a detection in a single view, and
-# for joined tracks to be free of doubt. Tuned on the studio.
+# for joined tracks to be free of doubt. Tuned on the studio: with double, an uncertain return is
+# not reported (tests/person/test_subject.py).
 MAX_LINK_GAP_S = 2.0
-LINK_SLACK_M = 0.25  # noise of a person's centre between sets; tuned on the studio
+# Noise of a person's centre between sets. Tuned on the studio: a tenth of it splits the subject's
+# track of cup_drink_s04 (config/field/no_depth.yaml), half and double change nothing.
+LINK_SLACK_M = 0.25
 
 # Keypoint pairs of each length, (1 or 2, 2), in the order of BUILD_SPREADS_M. A limb has one pair
 # for each side, whose lengths are averaged.
