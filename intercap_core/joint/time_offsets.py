@@ -120,7 +120,7 @@ class _Innovations:
 
     @classmethod
     def of(cls, seen: PointObservations, times: np.ndarray) -> _Innovations | None:
-        """Innovations of observations; None if too few are in successive frames."""
+        """Innovations; None if too few are in successive frames, or if most are 0."""
         step = np.diff(times)
         if not len(step):
             return None
@@ -139,7 +139,11 @@ class _Innovations:
             weight[:, :, here] *= min(1.0, 4.0 / np.count_nonzero(here))
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
             scale[here] = SIGMA_PER_MAD * np.median(size) if len(size) else 1.0
-        scale = np.maximum(scale, 1e-9)[:, None]
+        # few residuals can agree by chance, or be copies: no part is taken for far better than all
+        pooled = SIGMA_PER_MAD * np.median(np.abs(residual)[weight > 0])
+        if pooled == 0:
+            return None
+        scale = np.maximum(scale, 0.25 * pooled)[:, None]
         frame, point = np.nonzero(weight.any(axis=1))
         return cls(
             (residual / scale)[frame, :, point],

@@ -61,6 +61,22 @@ def _is_within(estimate: OffsetEstimate, limit: float) -> bool:
     return bool((error < limit).all() and (error < 3 * estimate.sigma[1:]).all())
 
 
+def test_residuals_of_zero_are_no_proof():
+    """A part whose residuals vanish, as of copied frames, neither decides nor narrows."""
+    usual = _observe()
+    residual = usual.residual.copy()
+    residual[:, :, 3] = 0
+    copied, without = (
+        _estimate(replace(usual, residual=residual)),
+        _estimate(replace(usual, weight=usual.weight * (np.arange(K) != 3))),
+    )
+    assert (copied.sigma[1:] > 0.3 * without.sigma[1:]).all()
+    assert _is_within(copied, 0.004)
+    assert _estimate(replace(usual, residual=0 * residual)).sigma[1:] == pytest.approx(
+        LOOSE_OFFSET_SIGMA_S
+    )
+
+
 def test_errors_are_as_large_as_stated_under_lasting_noise():
     errors, stated = [], []
     for seed in range(6):
