@@ -24,12 +24,6 @@ from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.person.segmentation.person_volume import distance_outside
 
-# A measurement is foreground if it is nearer than the background by BEFORE_MM + BEFORE_PER_DEPTH *
-# depth: five standard deviations of the sensor's random error and its bias between images
-# (Toelgyessy et al., Sensors 21(2):413, 2021).
-BEFORE_MM = 15.0
-BEFORE_PER_DEPTH = 0.005
-
 
 @dataclass(frozen=True, eq=False)
 class DepthBackground:
@@ -53,8 +47,7 @@ class DepthBackground:
             images: at most 25 samples of the recording, (H, W) uint16 mm.
             reach_mm: (H, W) see :attr:`reach`.
         """
-        tolerance = (BEFORE_MM + BEFORE_PER_DEPTH * background).astype(np.uint16)
-        behind = background + tolerance
+        behind = background + _tolerance(background).astype(np.uint16)
         gone = np.zeros(background.shape, np.uint8)
         for image in images:
             absent = ((image == 0) | (image > behind)).view(np.uint8)
@@ -64,7 +57,7 @@ class DepthBackground:
         # narrow strips are edges of furniture, where measurements often fail: they stay background
         not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         depth = np.where(not_static > 0, 0, background).astype(np.uint16)
-        near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
+        near = np.maximum(depth - _tolerance(depth), 0)
         limit = np.where(depth > 0, near, reach_mm)
         return cls(depth, reach_mm, np.minimum(limit, reach_mm).astype(np.uint16))
 
@@ -88,7 +81,16 @@ class DepthBackground:
     def shows(self, image: np.ndarray) -> np.ndarray:
         """Mask (H, W) of the pixels of an image (H, W), uint16 mm, that show the background."""
         away = cv2.absdiff(image, self.depth)
-        return (self.depth > 0) & (away <= BEFORE_MM + BEFORE_PER_DEPTH * self.depth)
+        return (self.depth > 0) & (away <= _tolerance(self.depth))
+
+
+def _tolerance(depth: np.ndarray) -> np.ndarray:
+    """Largest distance (H, W), mm, of a measurement from a background (H, W), mm, that it shows.
+
+    Five standard deviations of a Kinect's random error and its bias between images (Toelgyessy et
+    al., Sensors 21(2):413, 2021).
+    """
+    return 15.0 + 0.005 * depth
 
 
 def _floating(image: np.ndarray) -> np.ndarray:
