@@ -24,6 +24,9 @@ METRIC_REGIONS = CONTACT_REGIONS[:12]  # regions compared with the truth: axes o
 BODY_PARTS = (
     "trunk", "left_arm", "right_arm", "left_leg", "right_leg", "left_hand", "right_hand", "face",
 )  # fmt: skip
+# A body with a larger mean vertex error is bad, metres: its frame should be flagged
+# (docs/evaluation.md).
+BAD_BODY_M = 0.040
 
 # Axes that the header does not name belong to one file or to the group of one camera: B bytes, N or D
 # images or other items, M = T * C images, P people, parts or pairs of cameras, X expression

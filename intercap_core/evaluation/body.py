@@ -8,17 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
+from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
 
 BODY_JOINTS = slice(0, 22)  # joints of SMPL-X, as the next three
 FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
 FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
 BOTH_HANDS = slice(25, 55)
-# Median length of a 3D normal error, in standard deviations of one coordinate: the median of the
-# chi distribution with three degrees of freedom.
-MEDIAN_CHI_3 = 1.5382
-# A body with a larger mean vertex error is bad, metres: its frame should be flagged
-# (docs/evaluation.md).
-BAD_BODY_M = 0.040
 
 
 def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
-from intercap_core.schemas import SCENE, TRUTH
+from intercap_core.schemas import BAD_BODY_M, SCENE, TRUTH
 from intercap_core.sequence_inputs import SequencePaths
 
 CLOUD_KEYS = (
@@ -148,7 +148,7 @@ class BodyErrors:
     @property
     def bad(self) -> np.ndarray:
         """Mask (T,) of frames with a vertex error above 40 mm."""
-        return self.pve > body.BAD_BODY_M
+        return self.pve > BAD_BODY_M
 
     @property
     def worst(self) -> int:

@@ -17,9 +17,8 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation import contact, object_errors
-from intercap_core.evaluation.body import BAD_BODY_M
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.schemas import METRICS, PER_VERTEX_METRICS
+from intercap_core.schemas import BAD_BODY_M, METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
 
 SUMMARY_TRUTH = (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.evaluation.body import MEDIAN_CHI_3
 from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
 
 # A pose with a larger error of either kind is lost (docs/evaluation.md).
 LOST_TRANSLATION_M = 0.050

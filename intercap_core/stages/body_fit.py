@@ -26,8 +26,8 @@ from intercap_core.body_fit.uncertainty import deviation, joint_covariance, wide
 from intercap_core.config import BodyFitSettings, BodyModels, digest
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
-from intercap_core.evaluation.body import BAD_BODY_M, MEDIAN_CHI_3
-from intercap_core.schemas import BODY_FIT, BODY_PARTS
+from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
+from intercap_core.schemas import BAD_BODY_M, BODY_FIT, BODY_PARTS
 
 # Median trunk keypoint error from which the fit is not of the subject's body; tuned on the studio.
 WRONG_TRUNK_M = 0.06

@@ -27,6 +27,9 @@ class Robust(NamedTuple):
 
 # Standard deviation over median absolute deviation of a Gaussian: 1 / Phi^-1(3/4) (Hampel 1974).
 SIGMA_PER_MAD = 1.4826
+# Median length of a 3D normal error, in standard deviations of one coordinate: the median of the
+# chi distribution with three degrees of freedom.
+MEDIAN_CHI_3 = 1.5382
 
 
 @register_jitable
