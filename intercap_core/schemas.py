@@ -340,6 +340,8 @@ JOINT = Schema(
         "cameras_corrected": "the cameras were refined; otherwise they are those of the scene",
     },
     optional_attributes={
+        "last_step_mm": "displacement of body or object by the last step, 95th percentile over frames",
+        "last_decrease": "decrease of the energy by the last step, as a share of the energy",
         "made_by": "name of the other program that made these results; absent for this program's",
     },
     fields={

@@ -19,6 +19,8 @@ class Minimum:
     """Result of one round of minimisation."""
 
     state: State  # Final state
+    previous: State  # State before the last accepted step
+    decrease: float  # Decrease of the energy by the last accepted step, as a share of the energy
     equations: BandedEquations  # Equations at the final state
     energy_before: dict[str, float]  # Energy of each term at the start
     steps: int  # Number of accepted steps
@@ -41,7 +43,7 @@ def minimise(
     stalling = 0.5  # damping with which a frame hardly moves, share of the diagonal
     accepted, refused, gained, converged = 0, 0, 0.0, False
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
-    here = linearise(state)
+    here, previous, decrease = linearise(state), state, 0.0
     before = here.energy
     for _ in range(max_steps):
         step = here.step(damping)
@@ -66,6 +68,7 @@ def minimise(
             continue
         gain = here.total - there.total
         gained += gain
+        previous, decrease = state, gain / here.total
         state, here, accepted = trial, there, accepted + 1
         moved |= damping < stalling
         damping = np.maximum(damping / 5.0, 1e-6)
@@ -73,7 +76,7 @@ def minimise(
             converged = True
             break
     stalled = (damping >= stalling) & ~moved
-    return Minimum(state, here, before, accepted, refused, converged, stalled)
+    return Minimum(state, previous, decrease, here, before, accepted, refused, converged, stalled)
 
 
 def _risen(change: np.ndarray) -> np.ndarray:

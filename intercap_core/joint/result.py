@@ -50,6 +50,8 @@ class JointFit:
     convergence: Convergence  # Outcome of the rounds
     flag_reasons: list[str]  # (T,) reasons not to trust a frame; "" if there is none
     cameras_corrected: bool  # Whether the cameras were corrected
+    last_step_m: float  # Displacement by the last step, 95th percentile over frames, metres
+    last_decrease: float  # Decrease of the energy by the last step, as a share of the energy
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,8 @@ def run(
         iterations=fitted.steps,
         refused=fitted.refused,
         converged=fitted.convergence == Convergence.CONVERGED,
+        last_step_mm=1e3 * fitted.last_step_m,
+        last_decrease=fitted.last_decrease,
         cameras_corrected=fitted.cameras_corrected,
         **inputs.attributes,
     ) as writer:

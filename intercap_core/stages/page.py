@@ -129,6 +129,8 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
         )
     steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
     end = "converged" if joint.attributes["converged"] else "iteration limit reached"
+    if "last_step_mm" in joint.attributes:
+        end += f" (last step {joint.attributes['last_step_mm']:.2g} mm)"
     corrected = ""
     if joint.attributes["cameras_corrected"]:
         posed = np.isfinite(rig.master_from_colour).all((1, 2))

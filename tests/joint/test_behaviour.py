@@ -198,6 +198,7 @@ def test_fit_at_a_minimum_converges_at_once(model):
     there = scene.minimise(max_steps=40).state
     again = minimise(scene.problem.equations, there, max_steps=40)
     assert again.converged and again.steps <= 2
+    assert np.abs(again.state.body - again.previous.body).max() < 1e-3 and again.decrease < 0.01
 
 
 def test_body_steps_as_if_no_object_were_unknown():

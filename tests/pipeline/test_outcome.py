@@ -87,6 +87,18 @@ def test_degradations_are_reported_by_camera(project: Project) -> None:
     ]
 
 
+@pytest.mark.parametrize(("step_mm", "is_noted"), [(0.4, False), (1.4, True)])
+def test_an_iteration_limit_is_noted_if_the_fit_still_moved(
+    project: Project, tmp_path: Path, step_mm: float, is_noted: bool
+) -> None:
+    path = tmp_path / "joint.h5"
+    path.write_bytes(project.artefact("s01", "joint").read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["converged"], file.attrs["last_step_mm"] = False, step_mm
+    assert any("1.4 mm" in note for note in outcome.notes("joint", path)) == is_noted
+    assert f"iteration limit reached (last step {step_mm:.2g} mm)" in outcome.line("joint", path)
+
+
 def test_flagged_frames_with_their_reasons(project: Project) -> None:
     flagged, frames, reasons = outcome.flagged_frames(project.artefact("s01", "metrics"))
     assert (flagged, frames) == (4, 5)  # one has no person, one no object by the track
