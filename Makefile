@@ -74,9 +74,9 @@ snakemake-lint: $(STAMP)
 # MediaPipe needs NumPy 1 and uses little of what it lists as required
 $(MEDIAPIPE)/.installed:
 	$(PYTHON) -m venv $(MEDIAPIPE)
-	$(MEDIAPIPE)/bin/pip install --quiet --no-deps mediapipe==0.10.21
 	$(MEDIAPIPE)/bin/pip install --quiet "numpy<2" "opencv-python-headless<4.12" absl-py attrs flatbuffers \
 	    "protobuf<5" matplotlib
+	$(MEDIAPIPE)/bin/pip install --quiet --no-deps mediapipe==0.10.21
 	touch $@
 
 mediapipe: $(MEDIAPIPE)/.installed
