@@ -73,6 +73,9 @@ class SceneSettings(Model):
     refine_extrinsics: bool = True
     """Refine the camera poses from the static background. The initial pose is kept if held-out
     points do not improve."""
+    find_starts: bool = True
+    """Search for cameras that started seconds apart, by the keypoints of moving people. false =
+    keep device times and stated starts."""
     floor_tolerance_mm: Positive = 15.0
     """Largest distance of a background point to the ground plane that counts as floor, mm."""
 

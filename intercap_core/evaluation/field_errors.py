@@ -48,7 +48,7 @@ class FieldScene:
     sigma_s: np.ndarray
     """(N,) stated standard deviation of the delay, seconds."""
     set_aside: np.ndarray
-    """(N,) bool: the scene stage excluded the camera because its delay is undetermined."""
+    """(N,) bool: the scene stage states that the camera's delay is undetermined."""
     before: np.ndarray
     """(N,) displacement by the given extrinsics, metres."""
     after: np.ndarray
@@ -92,6 +92,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
         apart = np.nanmedian(true_late, axis=0)
         error = np.nanmedian(late - true_late, axis=0)
         unseen = np.asarray((found["image_of"] < 0).all(axis=0))
+        named = np.array(["start not determined" in note for note in found.text("note")])
         poses = true["master_from_colour"][order]
         before, after = (
             displacement(found[key], poses, master)
@@ -112,7 +113,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
             (apart - apart[master])[counted],
             (error - error[master])[counted],
             found["time_offset_sigma"][counted],
-            unseen[counted],
+            (unseen | named)[counted],
             before[counted],
             after[counted],
             stated[counted],
@@ -164,7 +165,8 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     """Figures of recordings whose cameras started at different times; milliseconds.
 
     A camera is solved if the error of its delay is below half a frame period. ``offset_wrong``
-    counts the cameras that are neither solved nor excluded by the scene stage.
+    counts the cameras that are neither solved nor reported as undetermined, ``starts_silent_share``
+    is their share.
     ``offset_normalised`` is 1 if the stated standard deviations are calibrated.
     """
     if not scenes:
@@ -182,6 +184,7 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     found = {
         "offset_solved_share": float(solved.mean()),
         "offset_wrong": float((~solved & ~aside).sum()),
+        "starts_silent_share": float((~solved & ~aside).mean()),
         "offset_cameras": float(len(late)),
     }
     if solved.any():
@@ -192,6 +195,15 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
         found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
         found["offset_normalised"] = float(np.median(late[known] / sigma[known])) / MEDIAN_CHI_1
     return found
+
+
+def in_step_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Share of the cameras that the scene stage moved by half a frame period or more, although they
+    started together."""
+    if not scenes:
+        return {}
+    moved = np.concatenate([np.abs(s.late_s) >= 0.5 / s.fps for s in scenes])
+    return {"in_step_moved_share": float(moved.mean())}
 
 
 def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:

@@ -127,19 +127,25 @@ def find_moments(
     *,
     master: int,
     stated: StatedStarts | None = None,
+    search: bool = True,
 ) -> Moments:
     """Synchronise the views: starts of recordings, then late images, then sub-frame offsets.
 
-    Images of a camera with an undetermined start are not assigned to any moment.
+    Images of a camera in doubt (:attr:`StartTimes.in_doubt`) are not assigned to any moment.
 
     Args:
         times: (T,) seconds of the sets.
         fps: nominal sets per second.
         available: (T, C) bool, the set has an image of the camera.
         stated: starts from other sources than the keypoints.
+        search: estimate starts from the keypoints; otherwise keep stated starts and device times.
     """
     stated = stated or StatedStarts.nothing(len(rig))
-    starts = find_starts(detections, rig, times, available, master=master, stated=stated)
+    starts = (
+        find_starts(detections, rig, times, available, master=master, stated=stated)
+        if search
+        else StartTimes.as_stated(stated, float(np.median(np.diff(times))) if len(times) > 1 else 0)
+    )
     subject = find_subject_views(AlignedPeople(detections, starts), rig, times)
     slips = find_slips(subject.keypoints, rig, times, fps, master=master)
     slip = starts.with_slips(slips.slip)

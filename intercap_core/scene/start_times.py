@@ -59,10 +59,10 @@ def find_starts(
         return as_stated
     # Largest delay: cameras are started by hand, or by one command that reaches them in turn.
     # 1.5 s, at most 40 % of the recording; tuned on the studio.
-    reach = min(round(1.5 / step), int(0.4 * sets))
     fewest = max(MIN_SHARED_S / step, 1)
-    if reach < 1 or sets - reach < fewest:
-        return as_stated
+    reach = min(round(1.5 / step), int(0.4 * sets), int(sets - fewest))
+    if reach < 1:
+        return replace(as_stated, too_short=True)
     rays = shift_images(follow_rays(detections, rig, times, available), as_stated.sets, np.nan)
     search = _Search(
         PairCosts.of(rays, rig, reach, fewest), master, step, known.bounds(step, reach), known.known
@@ -72,7 +72,10 @@ def find_starts(
     certain = {c: bool(rejected[c]) or search.is_apart(late, c) for c in others}
     # if one camera certainly started apart, the cameras were not started together
     result = replace(
-        as_stated, apart=any(certain.values()) or known.states_apart(step), rejected=rejected
+        as_stated,
+        apart=any(certain.values()) or known.states_apart(step),
+        rejected=rejected,
+        beyond=tuple(c for c in others if search.is_beyond(late, c)),
     )
     shown = search.shown(late)
     for c in others:
@@ -191,9 +194,21 @@ class _Search:
     def is_apart(self, sets: np.ndarray, camera: int, instead: int = 0) -> bool:
         """Whether a camera's delay significantly differs from ``instead``, by at least
         :data:`FEWEST_SETS_APART` sets. Smaller differences are slips or time offsets."""
-        if abs(sets[camera] - instead) < FEWEST_SETS_APART:
+        if abs(sets[camera] - instead) < FEWEST_SETS_APART or self._at_end(sets, camera):
             return False
         return self._significant(self._worse(sets, camera, instead), sets, camera)
+
+    def is_beyond(self, sets: np.ndarray, camera: int) -> bool:
+        """Whether a camera's delay is at an end of the searched range, and significant."""
+        return self._at_end(sets, camera) and self._significant(
+            self._worse(sets, camera, 0), sets, camera
+        )
+
+    def _at_end(self, sets: np.ndarray, camera: int) -> bool:
+        """Whether a camera's delay is the first or the last with a known cost: no minimum."""
+        profile = self.pairs.profile(camera, self._others(camera), sets)
+        known = np.flatnonzero(np.isfinite(profile)) - self.pairs.reach
+        return len(known) > 0 and sets[camera] in (known[0], known[-1])
 
     def _significant(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
         """Whether the cost increases ``worse`` (N,), by block, are significant.
@@ -247,7 +262,7 @@ class _Search:
         ``if_few``: the answer if there are too few blocks.
         """
         next_best = self._next_best(sets, camera)
-        if next_best is None:
+        if next_best is None or self._at_end(sets, camera):
             return False
         worse = self._worse(sets, camera, next_best)
         if len(worse) < FEWEST_BLOCKS:

@@ -188,6 +188,10 @@ class StartTimes:
     NaN."""
     rejected: np.ndarray
     """(C,) bool: the keypoints contradict the stated start."""
+    beyond: tuple[int, ...] = ()
+    """Cameras whose images agree best at an end of the searched range."""
+    too_short: bool = False
+    """The recording is too short for a search."""
 
     @classmethod
     def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:

@@ -113,8 +113,9 @@ def run(
         rig, master = source.rig, source.rig.names.index(source.master)
         stated, disagree = _stated_starts(source, starts or {}, master)
         moments = find_moments(
-            people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
-        )
+            people, rig, source.time_s, source.fps, source.available, master=master, stated=stated,
+            search=settings.find_starts,
+        )  # fmt: skip
         subject, image_of = moments.subject, moments.image_of
         ground_notes = _check_stated_up(source, subject)
         backgrounds = _backgrounds(source, subject, moments.slip)
@@ -346,6 +347,15 @@ def _notes(
         notes[c].append(
             "set aside: the cameras were not started together, and by how much this one is out of "
             "step could not be told; state when it started (starts of the annotation)"
+        )
+    for c in starts.beyond:
+        notes[c].append(
+            "start not determined: its images agree best with the others at the end of the "
+            "searched range; if it is out of step, state when it started (starts of the annotation)"
+        )
+    if starts.too_short:
+        notes[source.rig.names.index(source.master)].append(
+            "starts of the other cameras were not searched: the recording is too short"
         )
     for interval in moments.slips.intervals:
         count, way = abs(interval.slip), "late" if interval.slip > 0 else "early"

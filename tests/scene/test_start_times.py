@@ -138,6 +138,26 @@ def test_person_who_stands_still_reveals_no_start():
     assert not starts.apart and not starts.late.any() and not starts.in_doubt.any()
 
 
+def test_optimum_at_the_end_of_the_search_is_named_and_refused():
+    late = np.where(np.arange(VIEWS) == 2, 1.5, 0.0)  # 22 sets are searched
+    starts = starts_of(walk(late, 15.0, 5.0), 15.0)
+    assert not starts.apart and not starts.sets.any() and not starts.in_doubt.any()
+    assert starts.beyond == (2,)
+
+
+def test_short_recordings_are_searched_as_far_as_they_allow():
+    late = np.where(np.arange(VIEWS) == 4, 0.3, 0.0)
+    assert starts_of(walk(late, 60.0, 1.6), 60.0).sets.tolist() == (late * 60).tolist()
+    starts = starts_of(walk(late, 30.0, 1.0), 30.0)
+    assert starts.too_short and not starts.sets.any()
+
+
+def test_search_can_be_switched_off():
+    people, times = walk(delays(15), 15.0, 5.0), np.arange(75) / 15
+    result = find_moments(people, RIG, times, 15.0, people.available, master=0, search=False)
+    assert not result.starts.sets.any()
+
+
 def test_middles_do_not_depend_on_sides():
     person = np.random.default_rng(2).uniform(0.4, 1, (135, 3))
     np.testing.assert_allclose(body_middles(swap_sides(person)), body_middles(person))

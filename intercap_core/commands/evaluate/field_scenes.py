@@ -42,6 +42,8 @@ def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     found |= keyed("field.", field_errors.start_figures(_of(evaluations, STARTS)))
     found |= keyed("field.rates_", field_errors.start_figures(_of(evaluations, RATES)))
     found |= keyed("field.", field_errors.beam_figures(_of(evaluations, BEAM)))
+    together = _of(evaluations, FLOOR) + _of(evaluations, BEAM)
+    found |= keyed("field.", field_errors.in_step_figures(together))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
             rate = measured.dataset.removeprefix(STARTS)
