@@ -9,8 +9,8 @@ millimetres at the point's depth. Each group of points has one row:
 - ``constant``: median size of each point's mean error in a view over the recording.
 - ``1 frame``, ``0.5 s``: correlation of the remaining error over this time.
 - ``3D``: median error of the points triangulated with the true cameras.
-- ``stated``: median standard error that follows from the views' disagreement.
-- ``ratio``: root mean square of 3D error over ``stated``; 1.7 if errors of views are independent.
+- ``stated``: median standard error of one coordinate, from the views' disagreement.
+- ``ratio``: root mean square of 3D error over ``stated``; sqrt(3) = 1.7 if views err independently.
 - ``found``: share of the points that the detector reports, of those inside the image.
 - ``rank``: rank correlation of confidence and size of the error, -1 for an ideal confidence.
 """
@@ -36,7 +36,6 @@ from intercap_core.project import Project, load_project
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.stage import StudioStage
 
-MAX_ERROR_PX = 40.0  # of a view that still counts as an inlier, 1080p; the default of stage person
 COLUMNS = ("seen", "hidden", "constant", "1 frame", "0.5 s", "3D", "stated", "ratio", "found",
            "rank")  # fmt: skip
 DIGITS = (1, 1, 1, 2, 2, 1, 1, 1, 2, 2)
@@ -46,22 +45,22 @@ def groups() -> dict[str, np.ndarray]:
     """Indices of the keypoints of each row."""
     names = np.array(KEYPOINT_NAMES[:25])
 
-    def ending(*words: str) -> np.ndarray:
+    def containing(*words: str) -> np.ndarray:
         return np.array([i for i, name in enumerate(names) if any(w in name for w in words)])
 
     hand = np.arange(21)
     tips, roots = hand[4::4], np.array([0, 5, 9, 13, 17])
     other = np.setdiff1d(hand, [*tips, *roots])
-    both = {"wrist and knuckles": roots, "fingers": other, "fingertips": tips}
+    hand_parts = {"wrist and knuckles": roots, "fingers": other, "fingertips": tips}
     return {
-        "shoulders": ending("shoulder"),
-        "elbows": ending("elbow"),
-        "wrists": ending("wrist"),
-        "hips": ending("left_hip", "right_hip"),
-        "knees": ending("knee"),
-        "ankles": ending("ankle"),
-        "feet": ending("toe", "heel"),
-        **{f"hand: {name}": np.r_[25 + rows, 46 + rows] for name, rows in both.items()},
+        "shoulders": containing("shoulder"),
+        "elbows": containing("elbow"),
+        "wrists": containing("wrist"),
+        "hips": containing("left_hip", "right_hip"),
+        "knees": containing("knee"),
+        "ankles": containing("ankle"),
+        "feet": containing("toe", "heel"),
+        **{f"hand: {name}": np.r_[25 + rows, 46 + rows] for name, rows in hand_parts.items()},
         "face": np.arange(67, 135),
     }
 
@@ -78,7 +77,7 @@ class DetectorErrors:
     """(T, C, 135) bool."""
     inside: np.ndarray
     """(T, C, 135) bool: an image exists and contains the true point."""
-    space_mm: np.ndarray
+    triangulated_mm: np.ndarray
     """(T, 135) error of the triangulated point; NaN = none."""
     stated_mm: np.ndarray
     """(T, 135) standard error of one coordinate by the views' disagreement."""
@@ -117,6 +116,8 @@ def measure(project: Project, sequence: str) -> DetectorErrors:
                 continue
             away = np.linalg.norm(people[:, :25, :2] - true[t, :25], axis=-1)
             away[people[:, :25, 2] <= 0] = np.nan
+            if not np.isfinite(away).any():
+                continue
             person = people[np.nanargmin(np.nanmedian(away, 1))]
             known = person[:, 2] > 0
             confidence[t, c] = person[:, 2]
@@ -126,7 +127,10 @@ def measure(project: Project, sequence: str) -> DetectorErrors:
     weights = np.where(np.isfinite(place[..., 0]), confidence, 0.0)
     flat = np.moveaxis(np.nan_to_num(place), 1, 2).reshape(-1, len(rig), 2)
     solved = triangulate(
-        flat, np.moveaxis(weights, 1, 2).reshape(-1, len(rig)), rig, max_error_px=MAX_ERROR_PX
+        flat,
+        np.moveaxis(weights, 1, 2).reshape(-1, len(rig)),
+        rig,
+        max_error_px=project.config.person.max_reprojection_px,
     )
     space = np.linalg.norm(solved.points - at_sets.reshape(-1, 3), axis=1).reshape(shape[0], 135)
     stated = spread(solved, rig).reshape(shape[0], 135)
@@ -137,47 +141,62 @@ def measure(project: Project, sequence: str) -> DetectorErrors:
 
 def figures(recordings: list[DetectorErrors], points: np.ndarray) -> tuple[float, ...]:
     """Figures of a group of ``points``, in the order of :data:`COLUMNS`."""
-    seen, hidden, constant = [], [], []
-    lags: tuple[list[tuple[np.ndarray, np.ndarray]], ...] = ([], [])
-    space, ratio, stated, reported, size, confidence = [], [], [], [], [], []
-    for r in recordings:
-        error = r.error_mm[:, :, points]
-        known, covered = np.isfinite(error[..., 0]), r.hidden[:, :, points]
-        seen.append(error[known & ~covered])
-        hidden.append(error[known & covered])
-        visible = np.where((known & ~covered)[..., None], np.clip(error, -100, 100), np.nan)
-        enough = np.isfinite(visible[..., 0]).sum(0) >= 0.5 * len(visible)
-        mean = np.nanmean(np.where(enough[..., None], visible, np.nan), axis=0)
-        constant.append(mean[enough])
-        rest = visible - mean
-        for store, lag in zip(lags, (1, max(1, round(0.5 * r.fps))), strict=True):
-            a, b = rest[lag:], rest[:-lag]
-            both = np.isfinite(a) & np.isfinite(b)
-            store.append((a[both], b[both]))
-        agreed = r.stated_mm[:, points] > 0
-        space.append(r.space_mm[:, points][agreed])
-        stated.append(r.stated_mm[:, points][agreed])
-        ratio.append(space[-1] / stated[-1])
-        reported.append(known[r.inside[:, :, points]])
-        size.append(np.linalg.norm(error[known], axis=-1))
-        confidence.append(r.confidence[:, :, points][known])
-
-    def median(values: list[np.ndarray]) -> float:
-        whole = np.linalg.norm(np.concatenate(values), axis=-1)
-        return float(np.median(whole)) if len(whole) else float("nan")
-
-    def correlation(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-        a, b = (np.concatenate(part) for part in zip(*pairs, strict=True))
-        return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 else float("nan")
-
-    whole = {name: np.concatenate(v) for name, v in dict(s=space, d=stated, r=ratio).items()}
-    rank = spearmanr(np.concatenate(confidence), np.concatenate(size)).statistic
+    samples = [_samples(recording, points) for recording in recordings]
+    pooled = {key: np.concatenate([sample[key] for sample in samples]) for key in samples[0]}
+    ratio = np.clip(pooled["triangulated"] / pooled["stated"], 0, 10)  # 10: outliers count alike
     return (
-        median(seen), median(hidden), median(constant), correlation(lags[0]), correlation(lags[1]),
-        float(np.median(whole["s"])), float(np.median(whole["d"])),
-        float(np.sqrt(np.mean(np.clip(whole["r"], 0, 10) ** 2))),
-        float(np.concatenate(reported).mean()), float(rank),
-    )  # fmt: skip
+        *(_median_length(pooled[key]) for key in ("seen", "hidden", "constant")),
+        _correlation(pooled["one frame"]),
+        _correlation(pooled["half a second"]),
+        float(np.median(pooled["triangulated"])),
+        float(np.median(pooled["stated"])),
+        float(np.sqrt(np.mean(ratio**2))),
+        float(pooled["found"].mean()),
+        float(spearmanr(pooled["confidence"], pooled["length"]).statistic),
+    )
+
+
+def _samples(recording: DetectorErrors, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Samples of one recording from which the figures are computed, millimetres.
+
+    ``seen``, ``hidden``, ``constant`` (N, 2) are errors; ``one frame``, ``half a second`` (N, 2)
+    pairs of the same coordinate at two times; the others (N,).
+    """
+    error = recording.error_mm[:, :, points]
+    found, hidden = np.isfinite(error[..., 0]), recording.hidden[:, :, points]
+    # 100 mm: single gross errors must not decide means and correlations
+    visible = np.where((found & ~hidden)[..., None], np.clip(error, -100, 100), np.nan)
+    often = np.isfinite(visible[..., 0]).sum(0) >= 0.5 * len(visible)
+    total = np.nansum(visible, axis=0)
+    mean = total / np.maximum(np.isfinite(visible).sum(0), 1)
+    rest = np.where(often[..., None], visible - mean, np.nan)
+    solved = recording.stated_mm[:, points] > 0
+    return {
+        "seen": error[found & ~hidden],
+        "hidden": error[found & hidden],
+        "constant": mean[often],
+        "one frame": _pairs(rest, 1),
+        "half a second": _pairs(rest, max(1, round(0.5 * recording.fps))),
+        "triangulated": recording.triangulated_mm[:, points][solved],
+        "stated": recording.stated_mm[:, points][solved],
+        "found": found[recording.inside[:, :, points]],
+        "confidence": recording.confidence[:, :, points][found],
+        "length": np.linalg.norm(error[found], axis=-1),
+    }
+
+
+def _pairs(values: np.ndarray, lag: int) -> np.ndarray:
+    """Pairs (N, 2) of known values (T, ...) that are ``lag`` frames apart."""
+    pairs = np.stack([values[:-lag], values[lag:]], axis=-1).reshape(-1, 2)
+    return pairs[np.isfinite(pairs).all(1)]
+
+
+def _correlation(pairs: np.ndarray) -> float:
+    return float(np.corrcoef(pairs.T)[0, 1]) if len(pairs) > 2 else float("nan")
+
+
+def _median_length(errors: np.ndarray) -> float:
+    return float(np.median(np.linalg.norm(errors, axis=1))) if len(errors) else float("nan")
 
 
 def main() -> None:

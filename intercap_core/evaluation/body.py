@@ -10,7 +10,8 @@ import numpy as np
 from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
 
-BODY_JOINTS = slice(0, 22)  # joints of SMPL-X, as the next three
+# Indices of SMPL-X's joints
+BODY_JOINTS = slice(0, 22)
 FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
 FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
 BOTH_HANDS = slice(25, 55)

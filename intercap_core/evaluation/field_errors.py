@@ -26,6 +26,7 @@ from intercap_core.evaluation.scene_errors import (
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.scene.starts import NOT_DETERMINED
 from intercap_core.schemas import FRAMES, PERSON, SCENE, TRUTH
 
 
@@ -92,7 +93,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
         apart = np.nanmedian(true_late, axis=0)
         error = np.nanmedian(late - true_late, axis=0)
         unseen = np.asarray((found["image_of"] < 0).all(axis=0))
-        named = np.array(["start not determined" in note for note in found.text("note")])
+        named = np.array([NOT_DETERMINED in note for note in found.text("note")])
         poses = true["master_from_colour"][order]
         before, after = (
             displacement(found[key], poses, master)

@@ -239,7 +239,7 @@ def _displacement(geometry: Geometry, before: State, after: State) -> float:
     It is the larger of the skin's mean and of the object's centre in each frame, and the 95th
     percentile over frames.
     """
-    skin = np.linalg.norm(PosedGeometry(geometry, after).skin - geometry.at(before).skin, axis=2)
+    skin = np.linalg.norm(geometry.at(after).skin - PosedGeometry(geometry, before).skin, axis=2)
     centre = np.linalg.norm(after.translation - before.translation, axis=1)
     return float(np.percentile(np.fmax(skin.mean(axis=1), centre), 95))
 

@@ -27,8 +27,8 @@ from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
-# Without a prior, seconds. Beyond 0.017 s, half the time between frames of a Kinect, an image
-# belongs to another frame set.
+# Without a prior, seconds: standard deviation of a uniform distribution over +-0.017 s, half the
+# time between frames of a Kinect. Beyond it, an image belongs to another frame set.
 LOOSE_OFFSET_SIGMA_S = 0.010
 POINT_SIGMA_M = 0.03  # prior of e, wide, so that only disagreement of views counts; tuned
 INNOVATION_OUTLIER = 3.0  # standard deviations at which an innovation counts a quarter; tuned
@@ -139,7 +139,8 @@ class _Innovations:
             weight[:, :, here] *= min(1.0, 4.0 / np.count_nonzero(here))
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
             scale[here] = SIGMA_PER_MAD * np.median(size) if len(size) else 1.0
-        # few residuals can agree by chance, or be copies: no part is taken for far better than all
+        # Few residuals may agree by chance, or be copies. The scale of a part is therefore at least
+        # a quarter of the scale of all parts (tuned).
         pooled = SIGMA_PER_MAD * np.median(np.abs(residual)[weight > 0])
         if pooled == 0:
             return None

@@ -24,8 +24,8 @@ from intercap_core.object_track.reduced_mask import covers
 
 COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
 # Lower limits of the standard deviations of measured colours (brightness, two ratios) in logarithms
-# of light: shadows and lamps change the brightness more than the two ratios. They decide if frames
-# show less noise than there is: an object at rest looks the same in all of them.
+# of light: shadows and lamps change the brightness more than the two ratios. They apply
+# where the frames vary less than the true noise, as for an object at rest.
 COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])  # tuned
 LEVELS_USED = slice(10, 251)  # grey levels; darker ones are noise, brighter ones saturated; tuned
 

@@ -22,7 +22,8 @@ from intercap_core.object_track.motion import HandMotion
 
 # Standard deviations of the motion between frames.
 STANDING_M = 0.015  # shift at rest: errors of fits, metres; tuned
-# Turn at rest, radians; tuned: half and double change probabilities of cup_drink_s02 by 0.1 to 0.2.
+# Turn at rest, radians; tuned. Half or double of it changes the probabilities of hypotheses in
+# cup_drink_s02 of the demo by 0.1 to 0.2.
 STANDING_RAD = np.radians(8)
 HELD_M = 0.02  # shift in a hand: errors of fits and joints, metres; tuned
 HELD_RAD = np.radians(10)  # turn in a hand, radians; tuned

@@ -18,7 +18,8 @@ from intercap_core.object_track.groups import find_groups, locate_group
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
 from intercap_core.object_track.view import View
 
-# A place that is occupied in a smaller share of the surveyed frames is that of a moving object.
+# A place that is occupied in less than this share of the surveyed frames belongs to a moving
+# object.
 SOMETIMES_PRESENT = 0.5  # tuned
 MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time; tuned
 MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time; tuned

@@ -17,7 +17,7 @@ from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 
 MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
 # Longest rest of the partition, half a minute at 30 Hz. It limits the run time, which grows with
-# the square of a rest's length: measured, a minute at rest takes 1.5 times as long without it.
+# the square of a rest's length; a minute at rest takes 1.5 times as long without it.
 MAX_REST_FRAMES = 900
 # Costs are minus log-likelihoods, nats.
 MOVING_COST = 9.0  # of each independent observation in motion, for the six numbers of a pose; tuned

@@ -109,7 +109,8 @@ class DepthRelief:
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
             around_it = np.asarray(near, int)[away < reach[near]]
             before = around_it[~self.room[around_it]]
-            enough = 4  # pixels; at 3 m, a Kinect has about 25 of these within 3 cm of a point
+            # pixels; at 3 m, a Kinect has about 25 of the thinned pixels within 3 cm of a point
+            enough = 4
             of_room[k] = len(before) < enough
             distances = self.distance[around_it if of_room[k] else before]
             if len(distances) < enough:

@@ -20,7 +20,7 @@ _CHOSEN_BY = {
 }
 _MAX_NAMED = 5  # left-out sequences named in a line
 # Last step of the joint fit that a warning names, mm: figures would still change. With smaller
-# ones, three times as many steps change errors by less than 0.1 mm (bench/RESULTS.md).
+# ones, twice as many steps change errors by less than 0.1 mm (bench/RESULTS.md).
 _LARGE_STEP_MM = 1.0
 
 
@@ -73,8 +73,10 @@ def notes(stage: str, path: Path) -> list[str]:
         if stage == "scene" and not artefact.attributes["ground_found"]:
             found.append("no floor was found")
         if stage == "joint" and not artefact.attributes["converged"]:
-            step = float(artefact.attributes.get("last_step_mm", 0.0))
-            if step > _LARGE_STEP_MM:
+            step = float(artefact.attributes.get("last_step_mm", np.inf))
+            if not artefact.attributes["iterations"]:
+                found.append("no step of the joint fit lowered its energy")
+            elif step > _LARGE_STEP_MM:
                 found.append(
                     f"the joint fit reached its iteration limit with a last step of {step:.1f} mm"
                 )

@@ -92,8 +92,8 @@ class PoseVerdict:
             return cls(True, ())
         mean = np.mean([e.mean for e in evidence])
         sigma = np.sqrt(sum(e.sigma**2 for e in evidence)) / len(evidence)
-        # by two standard deviations; tuned on the studio
-        return cls(bool(mean <= -2.0 * sigma), tuple(evidence))
+        # by two standard deviations, and by 2 %, which decides in long recordings; tuned
+        return cls(bool(mean <= min(-2.0 * sigma, np.log(0.98))), tuple(evidence))
 
     def __str__(self) -> str:
         if not self.evidence:

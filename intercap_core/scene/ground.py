@@ -23,7 +23,8 @@ MIN_FOOT_SETS = 5
 # Cosine of the largest angle of a floor point's normal to the plane's, 20 degrees. Tuned on the
 # studio.
 FLOOR_COSINE = 0.94
-# Largest distance of a point from a plane before the plane is refined. Tuned on the studio.
+# Largest distance of an inlier from a plane hypothesis that is not refined yet. Tuned on the
+# studio.
 UNREFINED_TOLERANCE_M = 0.03
 # Depth under a plane from which a point is evidence against it as the floor. Tuned on the studio:
 # at 0.2 m, platforms of 15 cm are taken for the floor.

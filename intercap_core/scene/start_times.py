@@ -200,8 +200,10 @@ class _Search:
 
     def is_beyond(self, sets: np.ndarray, camera: int) -> bool:
         """Whether a camera's delay is at an end of the searched range, and significant."""
-        return self._at_end(sets, camera) and self._significant(
-            self._worse(sets, camera, 0), sets, camera
+        return (
+            abs(sets[camera]) >= FEWEST_SETS_APART
+            and self._at_end(sets, camera)
+            and self._significant(self._worse(sets, camera, 0), sets, camera)
         )
 
     def _at_end(self, sets: np.ndarray, camera: int) -> bool:
@@ -237,6 +239,8 @@ class _Search:
 
     def _is_shown(self, sets: np.ndarray, camera: int) -> bool:
         """Whether a camera's delay significantly differs from 0, or from the next best delay."""
+        if self._at_end(sets, camera):
+            return False
         if self.is_apart(sets, camera):
             return True
         next_best = self._next_best(sets, camera)

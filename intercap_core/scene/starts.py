@@ -22,6 +22,7 @@ from intercap_core.formats.detections.read import PeopleOfImages
 # Standard deviation of the time offset of synchronised devices: a third of 1/30 s. Tuned on the
 # studio.
 PRIOR_OFFSET_S = 0.01
+NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
 FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a late start; tuned
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 # Combined standard deviations beyond which keypoints overrule a stated start. At three, about one
@@ -191,7 +192,7 @@ class StartTimes:
     beyond: tuple[int, ...] = ()
     """Cameras whose images agree best at an end of the searched range."""
     too_short: bool = False
-    """The recording is too short for a search."""
+    """The recording, or its number of frame sets, is too small for a search."""
 
     @classmethod
     def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:

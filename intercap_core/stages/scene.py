@@ -30,7 +30,7 @@ from intercap_core.scene.ground import (
 )
 from intercap_core.scene.lens_exchange import LensExchange, exchange_lenses
 from intercap_core.scene.moments import Moments, describe_stated_start, find_moments
-from intercap_core.scene.starts import StatedStarts, describe_start
+from intercap_core.scene.starts import NOT_DETERMINED, StatedStarts, describe_start
 from intercap_core.scene.subject_views import SubjectViews, triangulate_views
 from intercap_core.scene.surfaces import (
     BACKGROUND_CELL_M,
@@ -349,13 +349,15 @@ def _notes(
             "step could not be told; state when it started (starts of the annotation)"
         )
     for c in starts.beyond:
-        notes[c].append(
-            "start not determined: its images agree best with the others at the end of the "
-            "searched range; if it is out of step, state when it started (starts of the annotation)"
-        )
+        if not starts.in_doubt[c]:
+            notes[c].append(
+                f"{NOT_DETERMINED}: its images agree best with the others at the end of the "
+                "searched range; if it is out of step, state when it started (starts of the "
+                "annotation)"
+            )
     if starts.too_short:
         notes[source.rig.names.index(source.master)].append(
-            "starts of the other cameras were not searched: the recording is too short"
+            "starts of the other cameras were not searched: the recording has too few frame sets"
         )
     for interval in moments.slips.intervals:
         count, way = abs(interval.slip), "late" if interval.slip > 0 else "early"

@@ -13,15 +13,20 @@ from pathlib import Path
 from intercap_core.errors import UserError
 
 VARIABLE = "INTERCAP_MEDIAPIPE"
-"""Environment variable with the Python of another environment."""
+"""Environment variable with the path of a Python interpreter that has MediaPipe."""
 _ROOT = Path(__file__).resolve().parents[2]
 _TOOL = _ROOT / "tools" / "mediapipe_keypoints.py"
+_OWN = _ROOT / ".venv-mediapipe"  # complete if it contains ".installed"
 
 
 def mediapipe_python() -> Path | None:
     """Python of the environment with MediaPipe; None if there is none."""
-    python = Path(os.environ.get(VARIABLE) or _ROOT / ".venv-mediapipe/bin/python")
-    return python if python.is_file() and _TOOL.is_file() else None
+    if not _TOOL.is_file():
+        return None
+    if VARIABLE in os.environ:
+        python = Path(os.environ[VARIABLE])
+        return python if os.access(python, os.X_OK) and python.is_file() else None
+    return _OWN / "bin" / "python" if (_OWN / ".installed").is_file() else None
 
 
 def detect_keypoints(images: Path, output: Path) -> None:
@@ -32,8 +37,9 @@ def detect_keypoints(images: Path, output: Path) -> None:
     python = mediapipe_python()
     if python is None:
         raise UserError(
-            "studio: 'keypoints: mediapipe' needs MediaPipe, which is not installed; run 'make "
-            f"mediapipe', or set {VARIABLE} to the Python of an environment with mediapipe 0.10.21"
+            f"studio: 'keypoints: mediapipe' needs MediaPipe ({VARIABLE} or {_OWN}) and {_TOOL}, "
+            "which are not there; run 'make mediapipe' in the repository, or set "
+            f"{VARIABLE} to the Python of an environment with mediapipe 0.10.21"
         )
     command = [str(python), str(_TOOL), str(images), str(output)]
     # TensorFlow Lite writes its start-up messages to the standard error

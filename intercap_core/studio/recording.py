@@ -195,7 +195,10 @@ class Kinect:
         return RoomView(self.true.colour, pose, self.stage.room, coloured=coloured)
 
     def occluded_keypoints(self, moment: StageState) -> np.ndarray:
-        """Mask (T, 135) of the subject's keypoints that a surface occludes in each image."""
+        """Mask (T, 135) of the subject's keypoints that body, object or room occlude in each image.
+
+        A second person is ignored.
+        """
         view, points = self._colour_view(coloured=False), self.stage.keypoints(moment)
         colours = np.zeros((len(self.stage.subject.rest), 3))
         hidden = np.zeros(points.shape[:2], bool)

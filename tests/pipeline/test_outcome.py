@@ -99,6 +99,14 @@ def test_an_iteration_limit_is_noted_if_the_fit_still_moved(
     assert f"iteration limit reached (last step {step_mm:.2g} mm)" in outcome.line("joint", path)
 
 
+def test_a_joint_fit_without_a_step_is_noted(project: Project, tmp_path: Path) -> None:
+    path = tmp_path / "joint.h5"
+    path.write_bytes(project.artefact("s01", "joint").read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["converged"], file.attrs["iterations"] = False, 0
+    assert "no step of the joint fit lowered its energy" in outcome.notes("joint", path)
+
+
 def test_flagged_frames_with_their_reasons(project: Project) -> None:
     flagged, frames, reasons = outcome.flagged_frames(project.artefact("s01", "metrics"))
     assert (flagged, frames) == (4, 5)  # one has no person, one no object by the track

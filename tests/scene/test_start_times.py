@@ -145,6 +145,14 @@ def test_optimum_at_the_end_of_the_search_is_named_and_refused():
     assert starts.beyond == (2,)
 
 
+def test_a_vague_statement_does_not_admit_an_optimum_at_the_end():
+    late = np.where(np.arange(VIEWS) == 2, 1.5, 0.0)
+    stated = np.where(np.arange(VIEWS) == 0, np.nan, 0.0)
+    vague = StatedStarts(stated, np.where(np.isnan(stated), np.nan, 1.0), ("a note",) * VIEWS)
+    starts = starts_of(walk(late, 15.0, 5.0), 15.0, stated=vague)
+    assert not starts.sets.any() and not starts.rejected.any()
+
+
 def test_short_recordings_are_searched_as_far_as_they_allow():
     late = np.where(np.arange(VIEWS) == 4, 0.3, 0.0)
     assert starts_of(walk(late, 60.0, 1.6), 60.0).sets.tolist() == (late * 60).tolist()

@@ -1,7 +1,8 @@
 """Part ``detector`` of `intercap evaluate`: all stages with keypoints of a real detector.
 
-MediaPipe detects the keypoints in the studio's images (:mod:`intercap_core.studio.mediapipe`). Its
-errors last over frames and are shared by views, and hands that hold an object are often not found.
+MediaPipe detects the keypoints in the studio's images (:mod:`intercap_core.studio.mediapipe`). The
+detector's errors last over frames and are shared by views, and it often misses hands that hold an
+object.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from intercap_core.commands.evaluate.part import (
 from intercap_core.commands.evaluate.sequences import areas
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.truth import match_times
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, METRIC_REGIONS, SCENE, TRUTH
 
@@ -64,16 +66,23 @@ def measure(project: Project, sequence: str) -> DetectorSequence:
     paths, truth = project.paths(sequence), truth_of(project, sequence)
     with artefacts.read(paths.scene, SCENE) as scene:
         times = scene["times"]
-    return DetectorSequence(metrics, _slips_of(paths.joint, truth, times, metrics.fps))
+    entry = project.object_of(sequence)
+    assert entry is not None  # the recordings of this part have objects
+    symmetry = SymmetryGroup.from_settings(entry.symmetry)
+    return DetectorSequence(metrics, _slips_of(paths.joint, truth, times, metrics.fps, symmetry))
 
 
-def _slips_of(joint: Path, truth: Path, times: np.ndarray, fps: float) -> list[float]:
+def _slips_of(
+    joint: Path, truth: Path, times: np.ndarray, fps: float, symmetry: SymmetryGroup
+) -> list[float]:
     with artefacts.read(joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
         at = match_times(truth, true["times"], times, fps)
         columns = [true.text("region_names").index(name) for name in METRIC_REGIONS[:2]]
+        true_rotation = true["rotation"][at]
+        rotation = symmetry.nearest_equivalent(fitted["rotation"], true_rotation)
         return grip_slips(
-            _in_object(fitted["joints"], fitted["rotation"], fitted["translation"]),
-            _in_object(true["joints"][at], true["rotation"][at], true["translation"][at]),
+            _in_object(fitted["joints"], rotation, fitted["translation"]),
+            _in_object(true["joints"][at], true_rotation, true["translation"][at]),
             true["region_contact"][at][:, columns],
             fps,
         )
@@ -90,8 +99,8 @@ def grip_slips(
     """Slip of each grip, metres: how far a wrist strays in the object's frame.
 
     A grip is an interval of at least 0.3 s in which a hand truly touches. Its slip is the 95th
-    percentile of the distance of the wrist's error from the mean error of the grip. True slips are
-    therefore no errors.
+    percentile of the distance of the wrist's error from the mean error of the grip. A true slip
+    does not count, because the true motion is subtracted.
 
     Args:
         wrists: (T, 2, 3) fitted wrists in the fitted object's frame, metres.

@@ -73,8 +73,10 @@ def evaluate(
     """
     begin = time.monotonic()
     if mediapipe_python() is None and not chosen.get(detector.PART.name, True):
-        print("part detector is left out: MediaPipe is not installed; run 'make mediapipe'")
+        print("part detector is left out: MediaPipe is not installed (make mediapipe)")
         chosen = {name: paths for name, paths in chosen.items() if name != detector.PART.name}
+        if not chosen:
+            raise UserError("part detector needs MediaPipe: run 'make mediapipe'")
     settings = {name: list(paths or PARTS[name].settings) for name, paths in chosen.items()}
     if seed is not None:
         settings = redraw_settings(settings, seed)

@@ -26,7 +26,7 @@ _CLASSES = (
     "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
-# Those of the numbers 1 to 90 that none of the 80 annotated categories of COCO has.
+# Category ids of COCO from 1 to 90 that no annotated category has.
 _UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 COCO_NAMES: dict[int, str] = dict(
     zip([i for i in range(1, 91) if i not in _UNUSED_IDS], _CLASSES, strict=True)

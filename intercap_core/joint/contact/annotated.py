@@ -82,7 +82,7 @@ def _find_far(
 ) -> list[AnnotationIssue]:
     """Find runs of frames in which the annotated part is more than 0.15 m from the object.
 
-    Unflagged frames of the studio have smaller errors (tuned).
+    The limit is tuned: unflagged frames of the studio have smaller errors.
     """
     of_part = (
         distance.min(axis=1)

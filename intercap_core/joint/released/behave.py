@@ -239,8 +239,8 @@ def _check_placement(
 ) -> None:
     """Raise UserError if the entry's mesh does not lie on the released ``<object>_fit.ply``.
 
-    Closed and simplified copies of a template are less than 10 mm (95th percentile) from it
-    (tuned).
+    Closed and simplified copies of a template are less than 10 mm (95th percentile) from it; the
+    limit is tuned.
     """
     meshes = {t: path.with_suffix(".ply") for t, path in files.items()}
     frames = [t for t, path in sorted(meshes.items()) if path.is_file()]

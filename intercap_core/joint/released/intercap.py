@@ -14,7 +14,8 @@ from intercap_core.errors import UserError
 from intercap_core.formats.released import INTERCAP, Results, check_range, intercap_file
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
-FULL_HAND = dict(POSE_BLOCKS)["left_hand_pose"]  # numbers of a full pose; fewer are components
+# Length of a full axis-angle hand pose; shorter vectors are PCA coefficients.
+FULL_HAND = dict(POSE_BLOCKS)["left_hand_pose"]
 
 
 def read_results(path: Path) -> Results:

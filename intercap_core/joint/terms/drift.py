@@ -22,7 +22,7 @@ from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContex
 
 # Change of a sequential fit's lasting errors: a random walk, m in one second. Tuned on the studio:
 # without both terms the object's error has a 95th percentile of 8.0 mm, with them 4.9
-# (`python -m bench.ablation`).
+# (bench/RESULTS.md, commit 86d72be).
 BODY_DRIFT, OBJECT_DRIFT = 0.010, 0.004
 
 

@@ -27,7 +27,8 @@ from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
 # Standard deviations of accelerations in everyday motion. Tuned on the studio: without E_S and E_A
-# the body's acceleration errs by 0.75 mm a frame^2, with them by 0.71 (`python -m bench.ablation`).
+# the body's acceleration errs by 0.75 mm a frame^2, with them by 0.71 (bench/RESULTS.md, commit
+# 86d72be).
 BODY_ACCELERATION = 6.0  # m/s^2, of trunk, limbs and carried objects
 FINGER_ACCELERATION = 10.0  # m/s^2; tuned on the studio
 ACCELERATION_OUTLIER = 2.0  # standard deviations: a start, a stop, an impact; tuned on the studio

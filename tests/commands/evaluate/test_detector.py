@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from intercap_core.commands.evaluate.detector import grip_slips
 from intercap_core.commands.evaluate.run import evaluate
+from intercap_core.errors import UserError
 from intercap_core.studio.mediapipe import VARIABLE
 
 
@@ -31,11 +31,10 @@ def test_short_touches_are_no_grips() -> None:
     assert grip_slips(wrists, np.zeros_like(wrists), holding, 15.0) == []
 
 
-def test_without_mediapipe_the_part_is_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_without_mediapipe_the_part_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
-    assert evaluate({"detector": []}, tmp_path / "out.json") == 0
-    assert "make mediapipe" in capsys.readouterr().out
-    assert not any(key.startswith("detector") for key in json.loads(Path("out.json").read_text()))
+    with pytest.raises(UserError, match="make mediapipe"):
+        evaluate({"detector": []}, tmp_path / "out.json")
+    assert not (tmp_path / "out.json").exists()
