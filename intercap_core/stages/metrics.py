@@ -58,7 +58,7 @@ def run(
     """
     object_, body_models, gender = models.object_, models.body_models, models.gender
     with artefacts.read(paths.joint, JOINT) as fitted:
-        made_by = {k: v for k, v in fitted.attributes.items() if k in JOINT.optional_attributes}
+        made_by = {k: v for k, v in fitted.attributes.items() if k == "made_by"}
     mesh = None if object_ is None else ObjectMesh.load(object_)
     fitted_body = read_body(paths.joint, "joint", body_models, gender)
     fitted_object = read_object(paths.joint, "joint")

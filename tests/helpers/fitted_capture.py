@@ -388,7 +388,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
         capture.paths["joint"], JOINT, object=object_name, iterations=3, refused=0,
-        converged=True, cameras_corrected=True, **identity,
+        last_step_mm=0.2, last_decrease=0.001, converged=True, cameras_corrected=True, **identity,
     ) as writer:  # fmt: skip
         _put(writer, body | {
             "betas": body["betas"][0], "rotation": capture.rotation,
