@@ -145,7 +145,8 @@ class Plan:
             # a unique content, in case Snakemake compares checksums of inputs
             lines = [*self._state(sequence, stage).reasons, uuid.uuid4().hex]
             path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-            later = max(newest, time.time()) + 1.0  # seconds
+            # seconds; less than any job takes, whose output must be newer than the mark
+            later = max(newest, time.time()) + 0.1
             os.utime(path, (later, later))
         return [path]
 
