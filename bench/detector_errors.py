@@ -72,7 +72,7 @@ class DetectorErrors:
     error_mm: np.ndarray
     """(T, C, 135, 2) detected minus true place at the point's depth; NaN = not detected."""
     confidence: np.ndarray
-    """(T, C, 135)."""
+    """(T, C, 135) confidence of the detector, from 0 to 1."""
     hidden: np.ndarray
     """(T, C, 135) bool."""
     inside: np.ndarray
@@ -82,10 +82,14 @@ class DetectorErrors:
     stated_mm: np.ndarray
     """(T, 135) standard error of one coordinate by the views' disagreement."""
     fps: float
+    """Frame sets per second."""
 
 
 def measure(project: Project, sequence: str) -> DetectorErrors:
-    """Compare the detections artefact with the true keypoints."""
+    """Compare the detections artefact of a virtual recording with its true keypoints.
+
+    Raises UserError if the studio did not make the recording, or if it has no detections yet.
+    """
     studio = project.config.studio
     if studio is None or sequence not in studio.captures:
         raise UserError(f"{project.path}: sequence {sequence!r} is not made by the studio")
@@ -143,7 +147,7 @@ def figures(recordings: list[DetectorErrors], points: np.ndarray) -> tuple[float
     """Figures of a group of ``points``, in the order of :data:`COLUMNS`."""
     samples = [_samples(recording, points) for recording in recordings]
     pooled = {key: np.concatenate([sample[key] for sample in samples]) for key in samples[0]}
-    ratio = np.clip(pooled["triangulated"] / pooled["stated"], 0, 10)  # 10: outliers count alike
+    ratio = np.clip(pooled["triangulated"] / pooled["stated"], 0, 10)  # a larger ratio counts as 10
     return (
         *(_median_length(pooled[key]) for key in ("seen", "hidden", "constant")),
         _correlation(pooled["one frame"]),
@@ -164,7 +168,7 @@ def _samples(recording: DetectorErrors, points: np.ndarray) -> dict[str, np.ndar
     """
     error = recording.error_mm[:, :, points]
     found, hidden = np.isfinite(error[..., 0]), recording.hidden[:, :, points]
-    # 100 mm: single gross errors must not decide means and correlations
+    # limited to 100 mm, so that single gross errors do not determine means and correlations
     visible = np.where((found & ~hidden)[..., None], np.clip(error, -100, 100), np.nan)
     often = np.isfinite(visible[..., 0]).sum(0) >= 0.5 * len(visible)
     total = np.nansum(visible, axis=0)

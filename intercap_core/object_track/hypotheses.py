@@ -31,7 +31,8 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, same_pose
 
 BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose; tuned
-# Of a frame: a mug turned in steps of 30 degrees. With 6, the true turn of a mug was dropped.
+# Largest number of hypotheses of a frame: enough for a mug turned in steps of 30 degrees. With 6,
+# the true turn of a mug was dropped.
 MAX_HYPOTHESES = 12  # tuned on the studio
 RIVAL_PROBABILITY = 0.01  # hypotheses below this probability are not considered further; tuned
 RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not followed, nats; tuned

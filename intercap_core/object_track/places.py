@@ -23,9 +23,9 @@ from intercap_core.object_track.view import View
 SOMETIMES_PRESENT = 0.5  # tuned
 MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time; tuned
 MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time; tuned
-# Largest evidence of a frame, nats, against a place that probably shows another object: nobody is
-# near, or a similar object was seen there while the tracked one was elsewhere. It is limited,
-# because the track may have mistaken one for the other.
+# Upper limit, in nats, of one frame's evidence against a place that probably shows another object:
+# no person is near it, or a similar object was visible there while the tracked object was
+# elsewhere. The evidence is limited because the track may have confused the two objects.
 OTHER_OBJECT_LOG_RATIO = 10.0  # tuned
 
 

@@ -33,12 +33,12 @@ from intercap_core.person.sides import BODY_POINTS, PARTNER
 MIN_COMMON_POINTS = 5
 # Largest median distance of a detection from the reprojected points of its person, px. Detector
 # biases and calibration errors are much smaller; a person half a metre away is 160 px off at 2.6 m.
-# Tuned on the studio: half of it loses images of the subject, double exchanges people who pass each
-# other 25 cm apart (tests/person/test_subject.py).
+# Tuned on the studio. With half of it, the subject is missed in some images. With double, people
+# who pass each other 25 cm apart are exchanged (tests/person/test_subject.py).
 SAME_PERSON_PX_AT_1080P = 60.0
-# Largest median distance between the rays of two views to one person. Tuned on the studio: a
-# quarter of it loses the subject of two views; with double, one person beside a stool (demo) is
-# taken for two in 17 instead of 8 of 45 frames.
+# Largest median distance between the rays of two views to one person, metres. Tuned on the studio.
+# With a quarter of it, the subject is missed in recordings of two views. With double, the demo's
+# person beside a stool is split into two people in 17 instead of 8 of 45 frames.
 SAME_PERSON_GAP_M = 0.12
 
 NOBODY = -1  # index of a person in a view that does not see it

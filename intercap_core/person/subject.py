@@ -37,11 +37,12 @@ from intercap_core.person.tracks import (
 )
 
 # The score of the person who touches the object most is multiplied by 1 + HANDLING_WEIGHT, that of
-# others in proportion to their contact. Not tuned: half of it reports the choice beside a second
-# person as doubtful (config/field/passer_by.yaml), double changes nothing there.
+# others in proportion to their contact. Not tuned. In config/field/passer_by.yaml, the choice of
+# the subject is reported as doubtful with half of it; double changes nothing.
 HANDLING_WEIGHT = 4.0
-# Another person of at least this share of the subject's score is reported. Not tuned: half of it
-# reports people beside the right subject (config/field/passer_by.yaml).
+# Another person is reported if its score is at least this share of the subject's. Not tuned. With
+# half of it, a second person is reported although the subject is clear
+# (config/field/passer_by.yaml).
 RIVAL_SHARE = 0.5
 
 Touches = Callable[[int, int, int], bool | None]

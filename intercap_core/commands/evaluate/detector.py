@@ -61,7 +61,10 @@ DetectorSequences = Measured[DetectorSequence]
 
 
 def measure(project: Project, sequence: str) -> DetectorSequence:
-    """Read the metrics of one recording and measure the slip of its grips."""
+    """Read the metrics of one recording and measure the slip of its grips.
+
+    Raises UserError if an artefact or the truth cannot be read.
+    """
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
     paths, truth = project.paths(sequence), truth_of(project, sequence)
     with artefacts.read(paths.scene, SCENE) as scene:

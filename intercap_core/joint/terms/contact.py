@@ -24,8 +24,9 @@ from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Of a touching patch's distance, metres: skin, mesh, calibration. Tuned on the studio: without E_C
-# contact of vertices has an F1 of 0.44, with it 0.51 (bench/RESULTS.md, commit 86d72be).
+# Standard deviation of a touching patch's distance, metres: errors of skin, mesh and calibration.
+# Tuned on the studio: without E_C contact of vertices has an F1 of 0.44, with it 0.51
+# (bench/RESULTS.md, commit 86d72be).
 CONTACT_SIGMA = 0.004
 # Weight of an annotated contact relative to a detected one while the region stands apart. Tuned on
 # `python -m bench.annotate_driven`: contact of the meshes has an F1 of 0.97 (weight 1: 0.88), and

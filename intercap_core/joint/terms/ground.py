@@ -17,8 +17,8 @@ from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Of the floor's height, metres. Tuned on the studio: without both terms soles are 3.8 mm off the
-# floor, with them 2.7 (bench/RESULTS.md, commit 86d72be).
+# Standard deviation of the floor's height, metres. Tuned on the studio: without both terms soles
+# are 3.8 mm off the floor, with them 2.7 (bench/RESULTS.md, commit 86d72be).
 GROUND_SIGMA = 0.005
 # An object's vertices below the floor weigh together as one measurement. Fewer vertices than this,
 # such as an edge that just touches the floor, weigh proportionally less. Tuned on the studio.
