@@ -76,6 +76,21 @@ class PersonGroup:
         """Coordinate-wise median (3,) of the known points, metres."""
         return np.nanmedian(self.points, 0)
 
+    def distance(self, other: PersonGroup) -> float:
+        """Return the distance of the person from ``other``, metres.
+
+        It is the median distance of the points that both have. The sides of one may be exchanged.
+        The centre is that of the known points, which differ from set to set. It is compared only if
+        less than :data:`MIN_COMMON_POINTS` points are known in both.
+        """
+        apart = np.linalg.norm(
+            self.points - np.stack([other.points, other.points[_MIRRORED]]), axis=-1
+        )
+        enough = np.isfinite(apart).sum(1) >= MIN_COMMON_POINTS
+        if enough.any():
+            return float(np.nanmedian(apart[enough], axis=1).min())
+        return float(np.linalg.norm(self.centre - other.centre))
+
     def without(self, views: np.ndarray) -> PersonGroup:
         """The same person without the detections of ``views`` (C,) bool."""
         return replace(self, members=np.where(views, NOBODY, self.members))
@@ -121,7 +136,7 @@ def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonG
         return groups
     result = []
     for other, both in zip(groups, shared, strict=True):
-        if both.any() and np.linalg.norm(group.centre - other.centre) < 0.3:
+        if both.any() and group.distance(other) < 0.3:
             return groups  # the same person again: two people are at least 0.3 m apart
         worse = group.errors >= other.errors
         group = group.without(both & worse)

@@ -92,7 +92,7 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
         # within 0.4 s position alone identifies a person; tuned on the studio
         free = [k for k in tracks if times[t] - times[k.sets[-1]] <= 0.4]
         pairs = sorted(
-            (float(np.linalg.norm(group.centre - track.groups[-1].centre)), g, k)
+            (group.distance(track.groups[-1]), g, k)
             for g, group in enumerate(in_set)
             for k, track in enumerate(free)
         )
@@ -135,26 +135,20 @@ class Person:
     """Tracks of one person."""
 
     parts: tuple[PersonTrack, ...]
-    """Tracks that do not overlap in time, in order of time."""
+    """Tracks without a common frame set, in order of their first sets. The sets of one may lie
+    between those of another."""
     doubts: tuple[str, ...] = ()
     """Messages on doubtful joins."""
 
     @cached_property
     def track(self) -> PersonTrack:
         """All parts as one track."""
-        joined = PersonTrack()
-        for part in self.parts:
-            joined.sets += part.sets
-            joined.groups += part.groups
-        return joined
+        groups = {t: g for part in self.parts for t, g in zip(part.sets, part.groups, strict=True)}
+        return PersonTrack(sorted(groups), [groups[t] for t in sorted(groups)])
 
     def meets(self, other: Person) -> bool:
-        """Whether the two overlap in time, so that they are certainly different people."""
-        return any(
-            a.sets[0] <= b.sets[-1] and b.sets[0] <= a.sets[-1]
-            for a in self.parts
-            for b in other.parts
-        )
+        """Whether a frame set shows both, so that they are certainly different people."""
+        return not set(self.track.sets).isdisjoint(other.track.sets)
 
 
 def join_tracks(
@@ -166,7 +160,7 @@ def join_tracks(
 
     Args:
         times: (T,) seconds.
-        together: tracks that do not overlap and belong to one person by the user's statement. This
+        together: tracks of one person by the user's statement, without a common frame set. This
             person is the first of the result.
     """
     rest = [track for track in tracks if track not in together]
@@ -201,9 +195,9 @@ def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
     if first.meets(second):
         return NEVER
     result = 0.0
-    for before, after in _seams(first, second):
-        apart = float(np.linalg.norm(after.groups[0].centre - before.groups[-1].centre))
-        gap = float(times[after.sets[0]] - times[before.sets[-1]])
+    for (before, earlier), (after, later) in _seams(first, second):
+        apart = later.distance(earlier)
+        gap = float(times[after] - times[before])
         if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
         # 1.2 m/s: a usual walk
@@ -213,18 +207,24 @@ def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
     return result + alike if alike > -3.0 else NEVER
 
 
-def _seams(first: Person, second: Person) -> list[tuple[PersonTrack, PersonTrack]]:
-    """Pairs of successive tracks, in order of time, of which one belongs to each person."""
-    own = set(map(id, first.parts))
-    parts = _ordered((*first.parts, *second.parts))
-    return [(a, b) for a, b in pairwise(parts) if (id(a) in own) != (id(b) in own)]
+_Sighting = tuple[int, PersonGroup]  # frame set, and the person in it
+
+
+def _seams(first: Person, second: Person) -> list[tuple[_Sighting, _Sighting]]:
+    """Pairs of successive sightings, in order of time, of which one belongs to each person."""
+    own = set(first.track.sets)
+    sightings = [
+        sighting
+        for person in (first, second)
+        for sighting in zip(person.track.sets, person.track.groups, strict=True)
+    ]
+    sightings.sort(key=lambda sighting: sighting[0])
+    return [(a, b) for a, b in pairwise(sightings) if (a[0] in own) != (b[0] in own)]
 
 
 def _doubt(first: Person, second: Person, times: np.ndarray) -> tuple[str, ...]:
     """Message on joining two people after a gap of over 2 s whose builds do not clearly agree."""
-    gap, start = min(
-        (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(first, second)
-    )
+    gap, start = min((float(times[b] - times[a]), b) for (a, _), (b, _) in _seams(first, second))
     if gap <= MAX_LINK_GAP_S or same_build(first.track, second.track) >= 1.0:
         return ()
     return (

@@ -16,7 +16,7 @@ from intercap_core.person.groups import PersonGroup
 from intercap_core.person.sides import swap_sides
 from intercap_core.person.subject import NamedDetection, SubjectDetections, find_subject
 from intercap_core.person.subject_hints import named_people, touch_test
-from intercap_core.person.tracks import PersonTrack, same_build
+from intercap_core.person.tracks import PersonTrack, join_tracks, same_build
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
 
@@ -107,6 +107,16 @@ def test_single_view_is_bridged_by_earlier_points(tmp_path):
     people = people_of(walking(SETS, ASIDE, STILL), walking(SETS, MIDDLE, STILL))
     people[5][1:] = nobody(1)[0][1:]
     np.testing.assert_array_equal(index_of(tmp_path, people)[5], [1, -1, -1, -1, -1, -1])
+
+
+def test_person_is_followed_whichever_points_are_seen(tmp_path):
+    """Upper body and knees, then hips and legs, in turn: the centre of the points jumps."""
+    people = people_of(walking(SETS, MIDDLE, STILL))
+    legs = [*range(8, 15), *range(19, 25)]
+    for t, c in np.ndindex(SETS, VIEWS):
+        hidden = np.setdiff1d(range(25), legs) if t % 2 else [11, 14, *range(19, 25)]
+        people[t][c][0][hidden] = 0
+    assert (index_of(tmp_path, people) == 0).all()
 
 
 def test_brief_visitor_at_the_centre_is_not_the_subject(tmp_path):
@@ -303,6 +313,17 @@ def test_uncertain_return_is_reported(tmp_path):
     assert len(subject.doubts) == 1 and "from frame 56 on" in subject.doubts[0]
     named = name(detections, people, (0, 2, 1), (0, 57, 1))
     assert not subject_of(detections, named=named).doubts
+
+
+def test_tracks_without_a_common_set_are_one_person():
+    whole = track_of(1.0, 60, 1)
+    groups = np.array(whole.groups, object)
+    odd, even = (PersonTrack(list(range(k, 60, 2)), groups[k::2].tolist()) for k in (1, 0))
+    times = np.arange(60) / FPS
+    (person,) = join_tracks([odd, even], times)
+    assert person.track.sets == whole.sets and person.track.groups == whole.groups
+    even.sets[0] = 1
+    assert len(join_tracks([odd, even], times)) == 2
 
 
 def track_of(size: float, sets: int, seed: int) -> PersonTrack:
