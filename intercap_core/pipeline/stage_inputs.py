@@ -25,6 +25,7 @@ from intercap_core.pipeline.provenance import Manifest, library_versions, proces
 from intercap_core.project import Project
 from intercap_core.sequence_inputs import FitSettings
 from intercap_core.stage_list import STAGES
+from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
 
@@ -117,11 +118,13 @@ def studio_manifest(project: Project, sequence: str, checksums: InputChecksums) 
     studio = project.config.studio
     if studio is None:
         raise KeyError(sequence)
-    given = {
+    given: dict[str, Any] = {
         "settings": studio.model_copy(update={"captures": {}}),
         "capture": studio.captures[sequence],
         "object_": project.object_of(sequence),
     }
+    if studio.captures[sequence].keypoints == "mediapipe" and DETECTOR_SCRIPT.is_file():
+        given["detector"] = DETECTOR_SCRIPT
     return _manifest(STUDIO, sequence, given, {}, checksums, None, {"cpu": processor()})
 
 

@@ -15,13 +15,14 @@ from intercap_core.errors import UserError
 VARIABLE = "INTERCAP_MEDIAPIPE"
 """Environment variable with the path of a Python interpreter that has MediaPipe."""
 _ROOT = Path(__file__).resolve().parents[2]
-_TOOL = _ROOT / "tools" / "mediapipe_keypoints.py"
+DETECTOR_SCRIPT = _ROOT / "tools" / "mediapipe_keypoints.py"
+"""Script that detects the keypoints; its checksum is part of the recordings' manifests."""
 _OWN = _ROOT / ".venv-mediapipe"  # complete if it contains ".installed"
 
 
 def mediapipe_python() -> Path | None:
     """Python of the environment with MediaPipe; None if there is none."""
-    if not _TOOL.is_file():
+    if not DETECTOR_SCRIPT.is_file():
         return None
     if VARIABLE in os.environ:
         python = Path(os.environ[VARIABLE])
@@ -37,11 +38,11 @@ def detect_keypoints(images: Path, output: Path) -> None:
     python = mediapipe_python()
     if python is None:
         raise UserError(
-            f"studio: 'keypoints: mediapipe' needs MediaPipe ({VARIABLE} or {_OWN}) and {_TOOL}, "
-            "which are not there; run 'make mediapipe' in the repository, or set "
-            f"{VARIABLE} to the Python of an environment with mediapipe 0.10.21"
+            f"studio: 'keypoints: mediapipe' needs MediaPipe ({VARIABLE} or {_OWN}) and "
+            f"{DETECTOR_SCRIPT}, which are not there; run 'make mediapipe' in the repository, or "
+            f"set {VARIABLE} to the Python of an environment with mediapipe 0.10.21"
         )
-    command = [str(python), str(_TOOL), str(images), str(output)]
+    command = [str(python), str(DETECTOR_SCRIPT), str(images), str(output)]
     # TensorFlow Lite writes its start-up messages to the standard error
     quiet = os.environ | {"GLOG_minloglevel": "3", "PYTHONPATH": ""}
     done = subprocess.run(command, env=quiet, capture_output=True, text=True, check=False)

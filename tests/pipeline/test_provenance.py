@@ -11,12 +11,16 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Field, Schema
+from intercap_core.pipeline import stage_inputs
+from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.pipeline.provenance import (
     Manifest,
     library_versions,
     read_manifest,
     write_manifest,
 )
+from intercap_core.project import load_project
+from tests.conftest import PROJECT_ROOT
 
 SCHEMA = Schema("x", 1, "x", {"a": Field(("T",), "float64", "numbers")}, {"gender": "of whom"})
 MADE = Manifest(
@@ -132,3 +136,19 @@ def test_texts_lie_in_no_heap(tmp_path: Path) -> None:
 def test_libraries_that_decide_numbers_are_named() -> None:
     assert {"numpy", "numba", "torch"} <= set(library_versions())
     assert "+" not in "".join(library_versions().values())
+
+
+@pytest.mark.parametrize(("settings", "stale"), [("detector/config", True), ("demo/config", False)])
+def test_an_edited_detector_makes_its_recordings_stale(
+    settings: str, stale: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "mediapipe_keypoints.py"
+    monkeypatch.setattr(stage_inputs, "DETECTOR_SCRIPT", script)
+    project = load_project(PROJECT_ROOT / f"config/{settings}.yaml")
+    made = []
+    for version in ("first", "second"):
+        script.write_text(f"# {version}")
+        checksums = InputChecksums(tmp_path / version)
+        made.append(stage_inputs.studio_manifest(project, next(iter(project.sequences)), checksums))
+    assert (made[0].fingerprint != made[1].fingerprint) == stale
+    assert ("mediapipe_keypoints.py" in "".join(made[1].differences(made[0]))) == stale
