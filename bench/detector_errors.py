@@ -26,43 +26,19 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from bench.command import exit_on_user_error
-from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.commands.evaluate.part import console_of, number
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import reproject, spread, triangulate
 from intercap_core.project import Project, load_project
+from intercap_core.studio.measured_detector import groups
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.stage import StudioStage
 
 COLUMNS = ("seen", "hidden", "constant", "1 frame", "0.5 s", "3D", "stated", "ratio", "found",
            "rank")  # fmt: skip
 DIGITS = (1, 1, 1, 2, 2, 1, 1, 1, 2, 2)
-
-
-def groups() -> dict[str, np.ndarray]:
-    """Indices of the keypoints of each row."""
-    names = np.array(KEYPOINT_NAMES[:25])
-
-    def containing(*words: str) -> np.ndarray:
-        return np.array([i for i, name in enumerate(names) if any(w in name for w in words)])
-
-    hand = np.arange(21)
-    tips, roots = hand[4::4], np.array([0, 5, 9, 13, 17])
-    other = np.setdiff1d(hand, [*tips, *roots])
-    hand_parts = {"wrist and knuckles": roots, "fingers": other, "fingertips": tips}
-    return {
-        "shoulders": containing("shoulder"),
-        "elbows": containing("elbow"),
-        "wrists": containing("wrist"),
-        "hips": containing("left_hip", "right_hip"),
-        "knees": containing("knee"),
-        "ankles": containing("ankle"),
-        "feet": containing("toe", "heel"),
-        **{f"hand: {name}": np.r_[25 + rows, 46 + rows] for name, rows in hand_parts.items()},
-        "face": np.arange(67, 135),
-    }
 
 
 @dataclass(frozen=True)

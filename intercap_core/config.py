@@ -297,9 +297,13 @@ class StudioCapture(Model):
     """Largest difference between the cameras' starts, seconds; their timestamps do not show it."""
     every: dict[Name, Annotated[int, Field(ge=2, le=12)]] = {}
     """Cameras with a lower frame rate: {k2: 2} records every second frame set only."""
-    keypoints: Literal["simulated", "mediapipe"] = "simulated"
-    """simulated = true keypoints with errors; mediapipe = detected in the images, see
+    keypoints: Literal["simulated", "measured", "mediapipe"] = "simulated"
+    """simulated = true keypoints with errors; measured = with errors as those of a real detector;
+    mediapipe = detected in the images, and those of measured in another folder; see
     docs/studio.md."""
+    depth_errors: Literal["usual", "large"] = "usual"
+    """large = depth biases of up to 11 mm, growing with distance and incidence, and holes at thin
+    parts; see docs/studio.md."""
     keypoint_bias: Annotated[float, Field(ge=0, le=3)] = 1.0
     """Scale of the detector's joint offsets from the body's joints, which are 10 to 20 mm at 1."""
     room: Literal["random", "furnished", "sparse", "bare"] = "random"

@@ -28,6 +28,7 @@ from intercap_core.schemas import CONTACT_REGIONS, TRUTH
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import MaskSimulator
+from intercap_core.studio.measured_detector import MeasuredDetector
 from intercap_core.studio.recording import CameraRecord, Kinect
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.rig import STAGGER_S
@@ -276,7 +277,8 @@ def make_capture(
     (output / MARK).touch()
     stage = StudioStage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
-    detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
+    kind = Detector if capture.keypoints == "simulated" else MeasuredDetector
+    detector = kind.build(stage.noise, stage.frames, capture.keypoint_bias)
     segmenter = MaskSimulator(
         stage.noise, stage.frames, stage.prop.name, passer_by=stage.passer_by is not None
     )

@@ -24,12 +24,12 @@ from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LE
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.studio.noise import NoiseSource
 
-_SWAPPED = np.arange(135)  # index of the same point on the other side; the face stays
+OTHER_SIDE = np.arange(135)  # index of the same point on the other side; the face stays
 for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
     if _name.startswith("left_"):
         _j = KEYPOINT_NAMES.index("right_" + _name[5:])
-        _SWAPPED[_i], _SWAPPED[_j] = _j, _i
-_SWAPPED[LEFT_HAND], _SWAPPED[RIGHT_HAND] = np.arange(46, 67), np.arange(25, 46)
+        OTHER_SIDE[_i], OTHER_SIDE[_j] = _j, _i
+OTHER_SIDE[LEFT_HAND], OTHER_SIDE[RIGHT_HAND] = np.arange(46, 67), np.arange(25, 46)
 _LEG_WORDS = ("_hip", "knee", "ankle", "toe", "heel")
 _LEGS = np.array(
     [i for i, n in enumerate(KEYPOINT_NAMES[:25]) if any(w in n for w in _LEG_WORDS) and i != 8]
@@ -84,7 +84,13 @@ class Detector:
         return cls(noise, frames, direction * size[:, None] * noise.scale)
 
     def detect(
-        self, camera: Camera, points: np.ndarray, axes: np.ndarray, hidden: np.ndarray, *who: str
+        self,
+        camera: Camera,
+        points: np.ndarray,
+        axes: np.ndarray,
+        hidden: np.ndarray,
+        holding: np.ndarray,
+        *who: str,
     ) -> np.ndarray:
         """Keypoints (T, 135, 3) x, y, confidence of one person in one camera.
 
@@ -92,6 +98,7 @@ class Detector:
             points: (T, 135, 3) true points, master frame, metres.
             axes: (T, 3, 3) rotation of the pelvis from the rest pose to the master frame.
             hidden: (T, 135) mask of occluded points.
+            holding: (T, 2) mask of frames in which the left, the right hand is at the object.
             who: name of the person's random stream; none for the subject.
         """
         noise, scale = self.noise, self.noise.scale
@@ -169,7 +176,7 @@ class Detector:
         pixels, confidence = pixels.copy(), confidence.copy()
         for t in np.flatnonzero(swapped.any(1)):
             rows = np.arange(67) if swapped[t, 0] else _LEGS
-            source = _SWAPPED[rows]
+            source = OTHER_SIDE[rows]
             pixels[t, rows], confidence[t, rows] = pixels[t, source], confidence[t, source]
             confidence[t, rows] *= 0.92
         return pixels, confidence

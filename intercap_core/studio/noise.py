@@ -52,7 +52,7 @@ class NoiseSource:
         """(frames, channels): zero mean, unit variance, correlated over ``correlation_s``."""
         if self.family == "b":
             correlation_s *= 1.7
-            return self.tails(self._first_order(rng, frames, channels, correlation_s))
+            return self.tails(self.first_order(rng, frames, channels, correlation_s))
         lag = max(correlation_s * self.fps, 1e-3)
         margin = int(np.ceil(3 * lag))
         white = rng.normal(size=(frames + 2 * margin, channels))
@@ -63,7 +63,7 @@ class NoiseSource:
             [np.convolve(white[:, k], kernel, "valid") for k in range(channels)], 1
         ).reshape(frames, channels)
 
-    def _first_order(
+    def first_order(
         self, rng: np.random.Generator, frames: int, channels: int, correlation_s: float
     ) -> np.ndarray:
         """First-order process (frames, channels) of unit variance."""

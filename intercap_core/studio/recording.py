@@ -31,7 +31,7 @@ from intercap_core.studio.render import (
     RoomView,
 )
 from intercap_core.studio.rig import STAGGER_S
-from intercap_core.studio.sensors import DepthSensor, heard
+from intercap_core.studio.sensors import DepthSensor, LargeErrors, heard
 from intercap_core.studio.stage import StageState, StudioStage
 from intercap_core.studio.subjects import body_colours
 
@@ -39,6 +39,7 @@ EXPOSURE_S = 1 / 60  # of a colour image in a lit room
 # Joints lie inside the body, whose own surface does not occlude them: a surface occludes a joint
 # only if it is nearer by more than this, metres.
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
+HOLDING_M = 0.015  # of a hand's keypoint from the object: half a finger's thickness and some air
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class CameraRecord:
     depth: np.ndarray
     """(T,) bool: there is depth that is not empty."""
     depth_bias: float
-    """Constant error of its depth, metres."""
+    """Constant error of its depth, metres; the error at 2.5 m if it grows with distance."""
 
 
 class Kinect:
@@ -102,11 +103,17 @@ class Kinect:
     def record(
         self, folder: CaptureFolder, detector: Detector, segmenter: MaskSimulator
     ) -> CameraRecord:
-        """Write the recording, keypoints/<camera>/ and candidates/<camera>.json."""
+        """Write the recording, keypoints/<camera>/ and candidates/<camera>.json.
+
+        If MediaPipe detects the keypoints, those of ``detector`` go to keypoints_measured/<camera>.
+        """
         stage, name = self.stage, self.true.name
         moment = stage.at(self.exposures)
         colour_view, depth_view = self._views()
-        sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode)
+        large = None
+        if stage.depth_errors == "large":
+            large = LargeErrors.draw(stage.noise, len(stage.rig.true))[self.index]
+        sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode, large)
         rng = stage.noise.rng("photo", name)
         gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
         photographer = Photographer(colour_view, gain, rng)
@@ -166,13 +173,12 @@ class Kinect:
         path = folder.path / "candidates" / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
-        if not real:
-            shown = self._detected(detector, moment, points, hidden)
-            people = detector.people(self.true, shown)
-            if passing:
-                walker = self._detected(detector, passing, others, others_hidden, "passer-by")
-                people = detector.with_passer_by(self.true, people, walker, others_hidden)
-            self._write_keypoints(folder, people)
+        shown = self._detected(detector, moment, points, hidden)
+        people = detector.people(self.true, shown)
+        if passing:
+            walker = self._detected(detector, passing, others, others_hidden, "passer-by")
+            people = detector.with_passer_by(self.true, people, walker, others_hidden)
+        self._write_keypoints(folder, people, "keypoints_measured" if real else "keypoints")
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return CameraRecord(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
@@ -243,15 +249,34 @@ class Kinect:
         """Keypoints (T, 135, 3) in the image of a person with true points (T, 135, 3)."""
         master = self.stage.rig.master_from_stage[:3, :3]
         axes = master @ moment.pelvis
-        return detector.detect(self.true, self.stage.to_master(points), axes, hidden, *who)
+        holding = np.zeros((len(points), 2), bool)
+        if isinstance(moment, StageState):
+            holding = hands_at_object(self.stage, moment, points)
+        return detector.detect(self.true, self.stage.to_master(points), axes, hidden, holding, *who)
 
-    def _write_keypoints(self, folder: CaptureFolder, people: list[list[np.ndarray]]) -> None:
-        target = folder.path / "keypoints" / self.true.name
+    def _write_keypoints(
+        self, folder: CaptureFolder, people: list[list[np.ndarray]], name: str
+    ) -> None:
+        target = folder.path / name / self.true.name
         target.mkdir(parents=True)
         for order, t in enumerate(self.sets):
             image, content = folder.image_number(t, order, self.stage.fps), to_json(people[t])
             (target / f"{image:012d}_keypoints.json").write_text(content)
-            folder.add_keypoints(self.true.name, t, self.stage.fps, content)
+            if name == "keypoints":
+                folder.add_keypoints(self.true.name, t, self.stage.fps, content)
+
+
+def hands_at_object(stage: StudioStage, moment: StageState, points: np.ndarray) -> np.ndarray:
+    """Mask (T, 2) of frames in which a point of the left, the right hand is near the object.
+
+    ``points``: (T, 135, 3) keypoints, stage frame. They lie inside the fingers.
+    """
+    hands = points[:, 25:67]
+    near = np.zeros((len(points), 42), bool)
+    for t, pose in enumerate(moment.stage_from_object if stage.prop else ()):
+        local = (hands[t] - pose[:3, 3]) @ pose[:3, :3]
+        near[t] = stage.prop.surface.signed_distance(local) < HOLDING_M
+    return np.asarray(near.reshape(-1, 2, 21).any(2))
 
 
 def surfaces_at(

@@ -68,6 +68,7 @@ class StudioStage:
     ) -> None:
         check_capture(capture, settings, None if entry is None else entry.name)
         self.depth_mode, self.has_depth = settings.depth_mode, capture.depth
+        self.depth_errors = capture.depth_errors
         self.frames, self.fps = capture.frames, settings.fps
         self.duration = capture.frames / settings.fps
         self.noise = NoiseSource(
@@ -233,7 +234,7 @@ def check_capture(
             f"recordings of layout {layout!r} are no videos; take 'video' out or set layout: plain",
         ),
         (
-            capture.keypoints != "simulated" and layout not in ("k4a", "plain"),
+            capture.keypoints == "mediapipe" and layout not in ("k4a", "plain"),
             f"keypoints in recordings of layout {layout!r} are simulated; take 'keypoints' out or "
             "set layout: plain",
         ),

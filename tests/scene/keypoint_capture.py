@@ -69,7 +69,9 @@ def keypoint_capture(
     people: list[list[list[np.ndarray] | None]] = [[None] * cameras for _ in range(frames)]
     for c, (kinect, (points, pelvis)) in enumerate(zip(kinects, shown, strict=True)):
         in_master = stage.to_master(points)
-        subject_points = detector.detect(kinect.true, in_master, turned @ pelvis, hidden[c])
+        subject_points = detector.detect(
+            kinect.true, in_master, turned @ pelvis, hidden[c], np.zeros((len(in_master), 2), bool)
+        )
         found = detector.people(kinect.true, subject_points)
         for t in kinect.sets:
             people[t][c] = found[t]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,10 +19,12 @@ from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.recording import Kinect
+from intercap_core.studio.recording import Kinect, surfaces_at
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import build_room
-from intercap_core.studio.stage import check_capture
+from intercap_core.studio.sensors import DepthSensor, LargeErrors
+from intercap_core.studio.stage import StudioStage, check_capture
+from intercap_core.studio.subjects import body_colours
 from tests.helpers.fitted_capture import object_entry
 
 FRAMES, FPS = 8, 5
@@ -103,6 +107,53 @@ def test_without_overlap_only_the_master_sees_the_middle() -> None:
     for index, camera in enumerate(rig.true):
         at = camera.colour_from_master[:3, :3] @ middle + camera.colour_from_master[:3, 3]
         assert bool(camera.colour.sees(at)) == (index == 0)
+
+
+def test_large_depth_errors_stay_within_the_data_sheet() -> None:
+    drawn = [LargeErrors.draw(NoiseSource(seed, 1.0, "a", 15.0), 6) for seed in range(200)]
+    bias = np.array([[camera.bias_m for camera in cameras] for cameras in drawn])
+    assert np.abs(bias).max() <= 0.011 and 0.004 < bias.std() < 0.006
+    worst = np.abs(bias).argmax(1) == 0  # the master: half of all, and a sixth of the others
+    assert 0.45 < worst.mean() < 0.7
+    still = LargeErrors.draw(NoiseSource(1, 0.0, "a", 15.0), 2)
+    assert still[0].bias_m == still[1].slope == 0
+
+
+def test_depth_errors_grow_with_distance_and_incidence() -> None:
+    errors = LargeErrors(bias_m=0.004, slope=0.001)
+    depth, cosine = np.array([2.5, 3.5, 2.5]), np.array([-1.0, 1.0, 0.5])
+    np.testing.assert_allclose(errors.at(depth, cosine), [0.004, 0.005, 0.008])
+
+
+@cache
+def depth_images(kind: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Depth image, metres, mask of the hands' pixels, and bias of one camera."""
+    stage = StudioStage(
+        capture_of(2, depth_errors=kind, room="bare"), StudioSettings(captures={}, cameras=2),
+        object_entry("stool"),
+    )  # fmt: skip
+    kinect = Kinect(stage, 0, "1080P")
+    moment = stage.at(kinect.exposures)
+    large = LargeErrors.draw(stage.noise, 2)[0] if kind == "large" else None
+    view = kinect._views()[1]
+    sensor = DepthSensor(view, stage.noise, "k1", large=large)
+    surfaces = surfaces_at(stage, moment, 0, body_colours(stage.subject, np.random.default_rng(0)))
+    at = stage.keypoints(moment)[0, 25:67] @ view.camera_from_stage[:3, :3].T
+    u, v = np.rint(view.lens.project(at + view.camera_from_stage[:3, 3])).astype(int).T
+    hands = np.zeros((view.lens.height, view.lens.width), bool)
+    hands[v, u] = True
+    hands = cv2.dilate(hands.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return sensor.image(view.cast(surfaces)) / 1000.0, hands, sensor.bias
+
+
+def test_hands_get_holes_and_the_room_the_bias() -> None:
+    usual, hands, usual_bias = depth_images("usual")
+    large, _, bias = depth_images("large")
+    holes = (usual > 0) & (large == 0)
+    assert holes[hands].mean() > 0.2 > 0.1 > holes[~hands].mean()
+    both = (usual > 0) & (large > 0)
+    grazing = 0.0005  # of a floor and a person, seen by a camera that looks down
+    assert np.median((large - usual)[both]) > bias - usual_bias + grazing
 
 
 @pytest.fixture(scope="module")
