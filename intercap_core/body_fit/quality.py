@@ -34,8 +34,9 @@ _MEASURED_SHARE = 0.15
 MIRRORED_SIGMA_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
 # Standard deviation along one coordinate of a limb that no view supports, metres. It may be
 # anywhere within its reach: a wrist is up to 0.55 m from the shoulder, an ankle up to 0.85 m from
-# the hip (anatomy). The linearised covariance of prior and fit is smaller.
-UNSEEN_SIGMA_M = {"arm": 0.20, "leg": 0.25}
+# the hip, a finger up to 0.08 m from the middle of its range (anatomy). The linearised covariance
+# of prior and fit is smaller.
+UNSEEN_SIGMA_M = {"arm": 0.20, "leg": 0.25, "hand": 0.035}
 
 
 class _Part(NamedTuple):
@@ -152,14 +153,20 @@ def trunk_distance(evidence: PartEvidence) -> np.ndarray:
 
 def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
     """Flag limbs and hands (N, 8) that a single view supports, with few depth points or none."""
-    flags = (
-        (evidence.views < 2)
-        & (evidence.measured_share < _MEASURED_SHARE)
-        & (evidence.visible_share > 0)
-    )
-    result = np.asarray(flags.numpy())
+    flags = (evidence.views < 2) & (evidence.visible_share > 0)
+    result = np.asarray((flags & (_measured(evidence) < 1)).numpy())
     result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
     return result
+
+
+def _measured(evidence: PartEvidence) -> Tensor:
+    """Share (N, 8) to which depth determines each part; 0 for hands.
+
+    Depth does not tell where the fingers of a hand point.
+    """
+    share = (evidence.measured_share / _MEASURED_SHARE).clamp(0, 1)
+    share[:, [BODY_PARTS.index("left_hand"), BODY_PARTS.index("right_hand")]] = 0
+    return share
 
 
 def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
@@ -177,7 +184,7 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
     In one view, the pose mirrored in depth is as likely: `MIRRORED_SIGMA_M`, reduced by depth
     points. In no view it is `UNSEEN_SIGMA_M`. For other parts it is 0.
     """
-    known = np.clip(evidence.measured_share.numpy() / _MEASURED_SHARE, 0, 1)
+    known = _measured(evidence).numpy()
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
     unseen = np.array([UNSEEN_SIGMA_M.get(limb, 0.0) for limb in limbs])
@@ -188,7 +195,7 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
 def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     """Return standard deviations (N, 55), metres, that allow for fits in a wrong local minimum.
 
-    Two deviations are added to ``sigma`` (N, 55) in quadrature:
+    The larger of two deviations is added to ``sigma`` (N, 55) in quadrature:
     - of a part whose detections are mostly outliers: their median distance, as a deviation;
     - of a limb that one view or no view supports: the possible lean (`_leaning`).
     A hand has at least the added deviation of its arm.
@@ -196,7 +203,7 @@ def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
     disputed = evidence.outlier_share.numpy() > 0.5
     distance = np.where(disputed, np.nan_to_num(evidence.distance.numpy()), 0) / 1.1774
-    distance = np.hypot(distance, _leaning(evidence))
+    distance = np.maximum(distance, _leaning(evidence))
     for side in ("left", "right"):
         arm, hand = BODY_PARTS.index(f"{side}_arm"), BODY_PARTS.index(f"{side}_hand")
         distance[:, hand] = np.maximum(distance[:, hand], distance[:, arm])

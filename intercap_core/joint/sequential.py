@@ -12,6 +12,7 @@ from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
 from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
+from intercap_core.joint.undetermined_hands import interpolate_hands
 
 POSE_NAMES = (*POSE_COLUMNS, "transl")
 """Datasets with a frame's pose and translation, in the order of the parameter vector."""
@@ -156,6 +157,9 @@ class SequentialFits:
             carried=carried,
             hands=hands | filled[:, None],
         )
+        times = scene["times"]
+        fps = 1 / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+        state = interpolate_hands(state, hands, fps)
         tracked = None
         if lost.all():
             state = state.without_object()

@@ -100,7 +100,7 @@ def contact_probability(
     ``given`` (T, R) are further log odds, from annotations.
     """
     correlated = max(1.0, 0.07 * fps)  # frames with the same error: 0.07 s, tuned on the studio
-    slip = _motion_evidence(motion)
+    slip = _motion_evidence(motion, fps)
 
     def posterior(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         near = _distance_evidence(motion.distance - error, sigma)
@@ -146,7 +146,7 @@ def _distance_evidence(distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return np.logaddexp(touching, np.log(0.01) - free) + free
 
 
-def _motion_evidence(motion: RegionMotion) -> np.ndarray:
+def _motion_evidence(motion: RegionMotion, fps: float) -> np.ndarray:
     """Log odds (T, R) of the slip while the object moves faster than its jitter.
 
     The slip is half-normal: with the jitter's standard deviation if the region holds the object,
@@ -154,7 +154,10 @@ def _motion_evidence(motion: RegionMotion) -> np.ndarray:
     """
     jitter, limit = 0.12, 4.0  # m/s; log odds of one frame
     moving = motion.object_speed > jitter
-    spread = np.maximum(motion.object_speed, jitter)
-    holding = -0.5 * np.square(motion.slip / jitter) - np.log(jitter)
+    # central differences of independent errors of a position
+    own = np.sqrt(np.maximum(motion.sigma**2 - LASTING_SIGMA**2, 0.0)) * fps / np.sqrt(2)
+    own = np.hypot(jitter, own)
+    spread = np.hypot(motion.object_speed, own)
+    holding = -0.5 * np.square(motion.slip / own) - np.log(own)
     free = -0.5 * np.square(motion.slip / spread) - np.log(spread)
     return np.where(moving, np.clip(holding - free, -limit, limit), 0.0)

@@ -134,6 +134,12 @@ class Contact(JointTerm):
         """
         self._probability, self._annotated = probability, labels == 1
 
+    @property
+    def probability(self) -> np.ndarray:
+        """Probability (T, R) that each region touches, as of :meth:`take_contact`."""
+        assert self._probability is not None, "take_contact comes first"
+        return self._probability
+
     def holding_probability(self) -> np.ndarray:
         """Probability (T, M) that each patch vertex holds the object, times its share of the patch.
 

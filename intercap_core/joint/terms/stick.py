@@ -76,6 +76,8 @@ class Stick(JointTerm):
         self._scale = context.settings.stick_weight * context.fps / CREEP**2
         self._grips = np.isin(self.geometry.patches.region, _GRIPPING)
         self._steady: np.ndarray | None = None  # (T - 1, M)
+        self._outlier = np.zeros(0)  # (M,) slip that counts a quarter, metres
+        self._kept = np.zeros(0, int)  # (K,) of the patch vertices
         self._index = np.zeros(0, int)  # (K,) of the skin samples
         self._weight = np.zeros((0, 0))  # (T - 1, K)
 
@@ -87,9 +89,13 @@ class Stick(JointTerm):
         holds = self._contact.holding_probability()
         both = np.minimum(holds[1:], holds[:-1])
         patch = self.geometry.patches.patch
+        points = self.geometry.at(state).skin[:, self.geometry.skin.patch]
+        local = local_points(points, state.rotation, state.translation)
+        jitter = self._jitter(local)
         if self._steady is None:
-            self._steady = self._weigh_glides(state)
+            self._steady = self._weigh_glides(local, jitter)
         both = both * self._steady
+        self._outlier = np.hypot(SLIP_OUTLIER / self._fps, 2 * jitter)
         kept, weights = [np.zeros(0, int)], [np.zeros((len(both), 0))]
         for number in np.unique(patch[self._grips]):
             members = np.flatnonzero(patch == number)
@@ -98,22 +104,42 @@ class Stick(JointTerm):
                 some, weight = _representatives(own)
                 kept.append(members[some])
                 weights.append(weight)
-        self._index = self.geometry.skin.patch[np.concatenate(kept)]
+        self._kept = np.concatenate(kept)
+        self._index = self.geometry.skin.patch[self._kept]
         self._weight = np.concatenate(weights, axis=1) * self._scale
 
-    def _weigh_glides(self, state: State) -> np.ndarray:
-        """Weights (T - 1, M) of patch vertices by their displacement over the object in 0.4 s.
+    def _jitter(self, local: np.ndarray) -> np.ndarray:
+        """Median displacement (M,) of each region from frame to frame while it holds the object.
 
-        Jitter averages to zero displacement, a sliding contact does not. 20 mm count a quarter.
-        Both are tuned on the studio.
+        Args:
+            local: (T, M, 3) patch vertices in the object's frame, metres.
         """
-        points = self.geometry.at(state).skin[:, self.geometry.skin.patch]
-        local = local_points(points, state.rotation, state.translation)
-        half = max(1, round(0.4 * self._fps / 2))
-        step = np.arange(max(len(state) - 1, 0))
-        before, after = np.maximum(step - half + 1, 0), np.minimum(step + half, len(state) - 1)
-        way = np.square(local[after] - local[before]).sum(axis=2)
-        return geman_mcclure_weight(way, 0.02)
+        regions = self.geometry.patches.region
+        held = self._contact.probability > 0.5
+        step = np.linalg.norm(np.diff(local, axis=0), axis=2)
+        result = np.zeros(len(regions))
+        for region in _GRIPPING:
+            members = np.flatnonzero(regions == region)
+            both = held[1:, region] & held[:-1, region]
+            if len(members) and both.any():
+                result[members] = np.median(step[np.ix_(both, members)])
+        return result
+
+    def _weigh_glides(self, local: np.ndarray, jitter: np.ndarray) -> np.ndarray:
+        """Weights (T - 1, M) of patch vertices by their displacement over the object.
+
+        The displacement leads from the mean place of the last 0.2 s to that of the next 0.2 s,
+        whose jitter is that of a step over the root of the number of frames. 20 mm beyond this
+        jitter count a quarter. Both are tuned on the studio.
+        """
+        half = max(1, round(0.2 * self._fps))
+        total = np.concatenate([np.zeros_like(local[:1]), local.cumsum(axis=0)])
+        step = np.arange(max(len(local) - 1, 0))
+        first, last = np.maximum(step + 1 - half, 0), np.minimum(step + 1 + half, len(local))
+        before = (total[step + 1] - total[first]) / (step + 1 - first)[:, None, None]
+        after = (total[last] - total[step + 1]) / (last - step - 1)[:, None, None]
+        way = np.square(after - before).sum(axis=2)
+        return geman_mcclure_weight(way, np.hypot(0.02, 2 * jitter / np.sqrt(half)))
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the slip of the vertices of the last :meth:`refresh`."""
@@ -131,7 +157,7 @@ class Stick(JointTerm):
             by_object = local_by_object(some, rotation, state.translation[at])
             return np.concatenate([by_body, by_object], axis=3)
 
-        self.add_steps(ALL, local, rows, self._weight, SLIP_OUTLIER / self._fps, equations)
+        self.add_steps(ALL, local, rows, self._weight, self._outlier[self._kept], equations)
 
 
 def _representatives(holds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

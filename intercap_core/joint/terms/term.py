@@ -147,7 +147,7 @@ class JointTerm(ABC):
         points: np.ndarray,
         rows: Rows,
         weight: np.ndarray,
-        outlier: float,
+        outlier: float | np.ndarray,
         equations: BandedEquations,
     ) -> None:
         """Add the displacements of points from frame to frame (Geman-McClure), undamped.
@@ -156,7 +156,7 @@ class JointTerm(ABC):
             points: (T, N, 3) metres.
             rows: derivatives of the points by the unknowns ``columns``.
             weight: (T - 1, N) 1/m^2 of each displacement.
-            outlier: displacement at which a point counts a quarter, metres.
+            outlier: displacement at which a point counts a quarter, metres; of all or each (N,).
         """
         step = np.diff(points, axis=0)
         square = np.square(step).sum(2)
