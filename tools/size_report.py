@@ -2,29 +2,22 @@
 
     python tools/size_report.py [ROOT]
 
-A constant is a name in capitals that a module binds to a number or to a tuple of numbers. It has a
-source if the comment on its line or above it cites one: a paper, a data sheet, a standard, anatomy,
-or a measurement. "Tuned" counts those whose comment says that they were tuned on the studio.
+Constants are counted as in :mod:`intercap_core.commands.evaluate.constants`.
 """
 
 from __future__ import annotations
 
 import ast
-import re
 import statistics
 import sys
 from collections import Counter, defaultdict
 from pathlib import Path
 
+from intercap_core.commands.evaluate.constants import count_constants
+
 PACKAGE = "intercap_core"
 GENERATED = ("artefacts.md", "workflow.md")
 CODE = (PACKAGE, "snakemake_executor_plugin_intercap_slurm", "tests", "bench", "tools", "workflow")
-SOURCE = re.compile(
-    r"et al|\b(19|20)\d\d\b|data ?sheet|doi|arXiv|ISO|IEEE|BOP|COCO|SMPL|Kinect|OpenPose|anatom|"
-    r"measured|standard|paper|equation|specification|python -m bench",
-    re.IGNORECASE,
-)
-TUNED = re.compile(r"\btuned\b|\bstudio\b", re.IGNORECASE)
 
 
 def main() -> None:
@@ -43,7 +36,7 @@ def main() -> None:
             if not folder.startswith(PACKAGE):
                 continue
             sizes.append(len(text.splitlines()))
-            counts += _constants(text)
+            counts += count_constants(text)
             for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.ClassDef):
                     classes[node.name].add(path)
@@ -77,44 +70,6 @@ def _folders(root: Path) -> list[str]:
 
 def _modules(folder: Path, *, deep: bool) -> list[Path]:
     return sorted(folder.rglob("*.py") if deep else folder.glob("*.py"))
-
-
-def _constants(text: str) -> Counter[str]:
-    """How many constants a module has, and how many of them cite a source or were tuned."""
-    counts: Counter[str] = Counter()
-    lines = text.splitlines()
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.AnnAssign):
-            targets = [node.target]
-        elif isinstance(node, ast.Assign):
-            targets = node.targets
-        else:
-            continue
-        if node.value is None or not _is_numeric(node.value):
-            continue
-        names = [n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
-        names = [name for name in names if name.id.lstrip("_").isupper()]
-        comment = _comment(lines, node.lineno, node.end_lineno or node.lineno)
-        counts["constants"] += len(names)
-        counts["source"] += len(names) * bool(SOURCE.search(comment))
-        counts["tuned"] += len(names) * bool(TUNED.search(comment))
-    return counts
-
-
-def _is_numeric(value: ast.expr) -> bool:
-    parts = [node for node in ast.walk(value) if isinstance(node, ast.Constant)]
-    return bool(parts) and all(type(node.value) in (int, float) for node in parts)
-
-
-def _comment(lines: list[str], first: int, last: int) -> str:
-    """The comments on a statement's own lines and directly above it."""
-    own = " ".join(line.partition("#")[2] for line in lines[first - 1 : last])
-    above = []
-    for line in reversed(lines[: first - 1]):
-        if not line.startswith("#"):
-            break
-        above.append(line)
-    return " ".join([own, *above])
 
 
 def _documents(root: Path) -> list[Path]:

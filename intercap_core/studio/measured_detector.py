@@ -25,9 +25,16 @@ from intercap_core.studio.keypoints import OTHER_SIDE, Detector
 from intercap_core.studio.noise import NoiseSource
 
 HANDS = (LEFT_HAND, RIGHT_HAND)
-_WRISTS = (7, 4)  # of the left and the right arm, whose confidence a hand's points get
-_NOSE, _EARS, _FACE = 0, [17, 18], slice(67, 135)
-_ABSENT = [1, 8, 20, 23]  # neck, middle of the hips and small toes, which MediaPipe lacks
+
+
+def _indices(*names: str) -> list[int]:
+    return [KEYPOINT_NAMES.index(name) for name in names]
+
+
+_WRISTS = _indices("left_wrist", "right_wrist")  # whose confidence a hand's points get
+_NOSE, _EARS = KEYPOINT_NAMES.index("nose"), _indices("left_ear", "right_ear")
+# Points that MediaPipe lacks
+_ABSENT = _indices("neck", "mid_hip", "left_small_toe", "right_small_toe")
 
 
 class Errors(NamedTuple):
@@ -62,21 +69,6 @@ ERRORS = {
     "hand: fingertips": Errors(9, 4, 1.0, 15),
     "face": Errors(6, 2, 0.5, 8),
 }
-CORRELATION_S, HIDDEN_S = 0.5, 1.0  # duration of all errors but those of hidden points; of these
-SHARED = 0.6  # of the jitter: the error that all views share, in each axis
-CONSTANT = 0.7  # of the jitter: the bias of a view
-HIDDEN_SHARED = 0.4  # share of the variance of hidden points' errors that views have in common
-HIDDEN_TAIL = 0.6  # standard deviation of the logarithm of the size of a hidden point's error
-LAG_S = 0.010  # of joints behind the motion
-UNSURE_SPREAD = 1.0  # standard deviation of the log odds of the confidence
-# A hand is found if its visible share exceeds the threshold, which is higher in a grasp
-HAND_THRESHOLD, HOLDING_THRESHOLD, HAND_SPREAD = 0.45, 0.65, 0.25
-HAND_SHIFT_MM = 50.0  # median error of a found hand, times its hidden share squared
-# Probability that the other hand is reported for one that is not found, if it is so near
-OTHER_HAND, OTHER_HAND_M = 0.25, 0.35
-# Cosine of the angle between face and camera beyond which the face is found
-FACE_COSINE, FACE_SPREAD = 0.63, 0.13
-_RAYLEIGH_MEDIAN = 1.18  # of two coordinates of unit variance
 
 
 def groups() -> dict[str, np.ndarray]:
@@ -106,6 +98,23 @@ def groups() -> dict[str, np.ndarray]:
 
 class MeasuredDetector(Detector):
     """A detector with the errors of :data:`ERRORS`; it detects one person and no small toes."""
+
+    correlation_s = 0.5  # duration of all errors but those of hidden points
+    hidden_s = 1.0  # of these
+    shared = 0.6  # of the jitter: the error that all views share, in each axis
+    constant = 0.7  # of the jitter: the bias of a view
+    hidden_shared = 0.4  # share of the variance of hidden points' errors that views have in common
+    hidden_tail = 0.6  # standard deviation of the logarithm of the size of a hidden point's error
+    lag_s = 0.010  # of joints behind the motion
+    confidence_spread = 1.0  # standard deviation of the log odds of the confidence
+    hand_threshold = 0.45  # visible share from which a hand is found
+    holding_threshold = 0.65  # the same of a hand that holds the object
+    hand_spread = 0.25  # standard deviation of these thresholds
+    hand_shift_mm = 50.0  # median error of a found hand, times its hidden share squared
+    other_hand_probability = 0.25  # that the other hand is reported for one that is not found,
+    other_hand_m = 0.35  # if its wrist is so near in the image
+    face_cosine = 0.63  # of the angle between face and camera from which the face is found
+    face_spread = 0.13  # its standard deviation
 
     @classmethod
     def build(cls, noise: NoiseSource, frames: int, body_bias: float = 1.0) -> MeasuredDetector:
@@ -140,12 +149,14 @@ class MeasuredDetector(Detector):
         pixels = camera.colour.project(at) + 1e-3 * self.noise.scale * error * metre_px
 
         level = np.where(hidden, _column("unsure"), _column("sure"))
-        confidence = expit(level + UNSURE_SPREAD * self._lasting(rng, 135))
+        confidence = expit(level + self.confidence_spread * self._lasting(rng, 135))
         confidence[:, _ABSENT] = 0
         apart = np.linalg.norm(pixels[:, _WRISTS[0]] - pixels[:, _WRISTS[1]], axis=1)
-        is_near = apart < OTHER_HAND_M * metre_px[:, 8, 0]
+        is_near = apart < self.other_hand_m * metre_px[:, 8, 0]
         pixels, confidence = self._hands(rng, pixels, confidence, visible, holding, is_near)
-        confidence[:, _FACE] = confidence[:, [_NOSE]] * self._sees_face(rng, camera, points)
+        confidence[:, RIGHT_HAND.stop :] = confidence[:, [_NOSE]] * self._sees_face(
+            rng, camera, points
+        )
         pixels, confidence = self._swapped(rng, pixels, confidence)
         inside = (pixels > -0.5).all(-1) & (
             pixels < (camera.colour.width - 0.5, camera.colour.height - 0.5)
@@ -160,7 +171,7 @@ class MeasuredDetector(Detector):
         return [[] if missed[t] else [subject[t]] for t in range(self.frames)]
 
     def _lasting(
-        self, rng: np.random.Generator, *shape: int, seconds: float = CORRELATION_S
+        self, rng: np.random.Generator, *shape: int, seconds: float = correlation_s
     ) -> np.ndarray:
         """First-order process (T, *shape) of unit variance with this correlation time."""
         channels = int(np.prod(shape))
@@ -172,15 +183,15 @@ class MeasuredDetector(Detector):
         rng = self.noise.detector_rng("measured", *who)
         jitter = _column("jitter")
         error = 1e3 * np.einsum("tij,kj->tki", axes, self.body_bias)
-        error += SHARED * jitter[:, None] * self._lasting(rng, 135, 3)
+        error += self.shared * jitter[:, None] * self._lasting(rng, 135, 3)
         speed = np.gradient(points[:, BODY], axis=0) * self.noise.fps
-        error[:, BODY] -= 1e3 * LAG_S * speed
+        error[:, BODY] -= 1e3 * self.lag_s * speed
         return error
 
     def _own(self, rng: np.random.Generator) -> np.ndarray:
         """Errors (T, 135, 2) of one view, mm."""
         jitter, fast = _column("jitter")[:, None], _column("fast")[:, None]
-        bias = CONSTANT * jitter * rng.normal(size=(135, 2))
+        bias = self.constant * jitter * rng.normal(size=(135, 2))
         white = rng.normal(size=(self.frames, 135, 2))
         return bias + jitter * (
             np.sqrt(1 - fast) * self._lasting(rng, 135, 2) + np.sqrt(fast) * white
@@ -202,15 +213,17 @@ class MeasuredDetector(Detector):
             image_from_master: (2, 3) the image's axes in the master's frame.
         """
         shared = self._lasting(
-            self.noise.detector_rng("measured", "hidden", *who), 135, 3, seconds=HIDDEN_S
+            self.noise.detector_rng("measured", "hidden", *who), 135, 3, seconds=self.hidden_s
         )
-        direction = np.sqrt(HIDDEN_SHARED) * shared @ image_from_master.T
-        direction += np.sqrt(1 - HIDDEN_SHARED) * self._lasting(rng, 135, 2, seconds=HIDDEN_S)
-        size = np.exp(HIDDEN_TAIL * self._lasting(rng, 135, 1, seconds=HIDDEN_S))
-        direction *= size / _RAYLEIGH_MEDIAN
+        direction = np.sqrt(self.hidden_shared) * shared @ image_from_master.T
+        direction += np.sqrt(1 - self.hidden_shared) * self._lasting(
+            rng, 135, 2, seconds=self.hidden_s
+        )
+        size = np.exp(self.hidden_tail * self._lasting(rng, 135, 1, seconds=self.hidden_s))
+        direction *= size / np.sqrt(2 * np.log(2))  # the median length of two coordinates
         error = np.where(hidden[..., None], _column("hidden")[:, None] * direction, 0)
         for side, hand in enumerate(HANDS):  # a hand is shifted as a whole
-            size = HAND_SHIFT_MM * (1 - visible[:, side]) ** 2
+            size = self.hand_shift_mm * (1 - visible[:, side]) ** 2
             error[:, hand] += size[:, None, None] * direction[:, hand][:, :1]
         return error
 
@@ -227,10 +240,10 @@ class MeasuredDetector(Detector):
 
         ``is_near``: (T,) mask of frames in which both wrists are close to each other in the image.
         """
-        threshold = np.where(holding, HOLDING_THRESHOLD, HAND_THRESHOLD)
-        found = visible + HAND_SPREAD * self._lasting(rng, 2) > threshold
+        threshold = np.where(holding, self.holding_threshold, self.hand_threshold)
+        found = visible + self.hand_spread * self._lasting(rng, 2) > threshold
         wrong = ~found & found[:, ::-1] & is_near[:, None]
-        wrong &= ndtr(self._lasting(rng, 2)) < OTHER_HAND
+        wrong &= ndtr(self._lasting(rng, 2)) < self.other_hand_probability
         pixels, confidence, right_places = pixels.copy(), confidence.copy(), pixels
         for side, hand in enumerate(HANDS):
             swap = wrong[:, side]
@@ -248,7 +261,7 @@ class MeasuredDetector(Detector):
         cosine = (forward * to_eye).sum(1) / (
             np.linalg.norm(forward, axis=1) * np.linalg.norm(to_eye, axis=1)
         )
-        return cosine[:, None] + FACE_SPREAD * self._lasting(rng, 1) > FACE_COSINE
+        return cosine[:, None] + self.face_spread * self._lasting(rng, 1) > self.face_cosine
 
 
 def _column(name: str) -> np.ndarray:

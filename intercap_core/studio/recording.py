@@ -39,7 +39,6 @@ EXPOSURE_S = 1 / 60  # of a colour image in a lit room
 # Joints lie inside the body, whose own surface does not occlude them: a surface occludes a joint
 # only if it is nearer by more than this, metres.
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
-HOLDING_M = 0.015  # of a hand's keypoint from the object: half a finger's thickness and some air
 
 
 @dataclass(frozen=True)
@@ -271,11 +270,12 @@ def hands_at_object(stage: StudioStage, moment: StageState, points: np.ndarray) 
 
     ``points``: (T, 135, 3) keypoints, stage frame. They lie inside the fingers.
     """
+    near_m = 0.015  # half a finger's thickness and some air
     hands = points[:, 25:67]
     near = np.zeros((len(points), 42), bool)
     for t, pose in enumerate(moment.stage_from_object if stage.prop else ()):
         local = (hands[t] - pose[:3, 3]) @ pose[:3, :3]
-        near[t] = stage.prop.surface.signed_distance(local) < HOLDING_M
+        near[t] = stage.prop.surface.signed_distance(local) < near_m
     return np.asarray(near.reshape(-1, 2, 21).any(2))
 
 

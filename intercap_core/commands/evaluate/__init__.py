@@ -7,5 +7,6 @@
 - ``workflows``: brings the artefacts of all projects up to date, and measures the minutes of each
   part.
 - ``seeds``: the same recordings with new random seeds.
+- ``constants``: counts the constants of the package.
 - ``reference``: the regression gate of the quick evaluation.
 """

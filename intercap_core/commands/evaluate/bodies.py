@@ -229,7 +229,7 @@ PART = EvaluationPart(
             "one_view",
         ),
     ),
-    budget_minutes=5.3,
+    budget_minutes=5.2,
     measure=measure,
     flat=flat,
     print_tables=print_bodies,

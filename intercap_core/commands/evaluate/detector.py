@@ -2,7 +2,8 @@
 
 MediaPipe detects the keypoints in the studio's images (:mod:`intercap_core.studio.mediapipe`). The
 detector's errors last over frames and are shared by views, and it often misses hands that hold an
-object.
+object. The same recordings are evaluated with simulated keypoints whose errors follow those
+measured of MediaPipe (:mod:`intercap_core.studio.measured_detector`).
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ from intercap_core.commands.evaluate.part import (
     keyed,
     number,
     truth_of,
+    variant,
     with_spread,
 )
 from intercap_core.commands.evaluate.sequences import areas
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.truth import match_times
+from intercap_core.evaluation.verdict.figures import TRUE, StatedError, stated_errors
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, METRIC_REGIONS, SCENE, TRUTH
@@ -133,35 +136,55 @@ def figures(recordings: Sequence[DetectorSequence]) -> Figures:
 
 
 def flat(evaluations: Sequence[DetectorSequences]) -> Figures:
-    """Keys ``detector.<measure>``."""
-    return keyed("detector.", with_spread(figures, _every(evaluations)))
+    """Keys ``detector.<measure>``; ``detector.measured_<measure>`` of the simulated keypoints."""
+    return {
+        key: value
+        for found in evaluations
+        for key, value in keyed(
+            f"detector.{variant(found.dataset, 'detector')}", with_spread(figures, found.errors)
+        ).items()
+    }
 
 
-def _every(evaluations: Sequence[DetectorSequences]) -> list[DetectorSequence]:
-    return [recording for found in evaluations for recording in found.errors]
-
-
-def print_table(evaluations: Sequence[DetectorSequences]) -> None:
-    """Print one row per recording, and one of all."""
+def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
+    """Print the errors of each recording, and the stated errors beside the true ones."""
     columns = [*FIGURES, "grip_slip_mm"]
     heads = [name.replace("_mm", " mm").replace("_", " ") for name in columns]
-    table = Table("recording", *heads, box=None, title="keypoints of MediaPipe, after joint")
-    every = _every(evaluations)
-    for name, some in [*((r.metrics.name, [r]) for r in every), ("all", every)]:
-        row = figures(some)
-        digits = (2 if "f1" in column else 1 for column in columns)
-        table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
-    console_of(160).print(table)
-    for name in (name for measured in evaluations for name in measured.missing):
-        print(f"{name}: no metrics")
+    for found in evaluations:
+        table = Table("recording", *heads, box=None, title=f"{found.dataset}, after joint")
+        for name, some in [*((r.metrics.name, [r]) for r in found.errors), ("all", found.errors)]:
+            row = figures(some)
+            digits = (2 if "f1" in column else 1 for column in columns)
+            table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
+        console_of(160).print(table)
+        table = Table("recording", *TRUE, box=None)
+        table.title = f"{found.dataset}: true error, stated error and its 80 % range, mm"
+        table.caption = "* the true error is outside the range"
+        for recording in found.errors:
+            stated = {error.part: error for error in stated_errors(recording.metrics)}
+            cells = (statement(stated[part]) if part in stated else "" for part in TRUE)
+            table.add_row(recording.metrics.name, *cells)
+        console_of(160).print(table)
+        for name in found.missing:
+            print(f"{found.dataset}: {name}: no metrics")
+
+
+def statement(error: StatedError) -> str:
+    """Text of the true error beside the stated one, such as ``12.0*: 8.0 (6.0 to 10.7)``."""
+    true = number(error.true, 1)
+    if not np.isfinite(error.stated):
+        return f"{true}: none stated" if true else ""
+    low, high = error.stated / error.factor, error.stated * error.factor
+    mark = "" if not true or low <= error.true <= high else "*"
+    return f"{true}{mark}: {error.stated:.1f} ({low:.1f} to {high:.1f})"
 
 
 PART = EvaluationPart(
     name="detector",
     stage="metrics",
-    settings=config_files("detector", "config"),
-    budget_minutes=7,
+    settings=config_files("detector", "config", "measured"),
+    budget_minutes=7.4,
     measure=measure,
     flat=flat,
-    print_tables=print_table,
+    print_tables=print_tables,
 )

@@ -19,6 +19,7 @@ from intercap_core.commands.evaluate import (
     objects,
     sequences,
 )
+from intercap_core.commands.evaluate.constants import total_constants
 from intercap_core.commands.evaluate.part import EvaluationPart, Figures, require_truth
 from intercap_core.commands.evaluate.reference import (
     REFERENCE,
@@ -99,6 +100,8 @@ def evaluate(
     minutes |= {f"{name}_minutes_budget": PARTS[name].budget_minutes for name in wanted}
     duration = (time.monotonic() - begin) / 60
     print_minutes(list(projects), minutes, duration)
+    figures["constants.total"] = total_constants()
+    print(f"constants of the package: {total_constants()} (557 at 6a7f266a)")
     figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
     flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -33,12 +33,13 @@ def test_projects_wait_for_those_that_make_their_recordings(
 ) -> None:
     runs = plan_runs(wanted)
     by_name = {run.project.config.dataset: run for run in runs}
-    assert len(runs) == len(by_name) == 1 + 3 + 3 + 6 + 4 + 7 + 1
+    assert len(runs) == len(by_name) == 1 + 3 + 3 + 6 + 4 + 7 + 2
     assert runs[0] is by_name["object"]  # what most wait for comes first
     stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
     assert by_name["object"].stages == stages
     for name in ("object_no_detector", "body_two_view"):
         assert by_name[name].after == [by_name["object"]]
+    assert by_name["detector_measured"].after == [by_name["detector"]]
     assert by_name["object_noise2"].after == []
 
 
