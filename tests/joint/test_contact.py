@@ -95,6 +95,22 @@ def test_brief_sip_is_detected():
     assert (probability[:11] < 0.5).all() and (probability[18:] < 0.5).all()
 
 
+@pytest.mark.parametrize("speed", [1.0, 3.0, 6.0])
+def test_object_passed_to_the_other_hand_in_a_swing_is_always_held(speed):
+    """Both hands hold for 0.2 s. Hands jump by 20 mm between frames, distances err by 10 mm."""
+    rng, (first, last), frames = np.random.default_rng(3), (22, 25), 45
+    distance, slip = np.full((frames, 2), 0.25), np.full((frames, 2), speed)
+    leaves = [0.02, 0.06, 0.12, 0.18]
+    distance[:last, 0], distance[last : last + 4, 0] = 0.0, leaves
+    distance[first:, 1], distance[first - 4 : first, 1] = 0.0, leaves[::-1]
+    true = distance == 0
+    slip[true] = np.abs(rng.normal(0, 0.3, true.sum()))
+    distance += np.abs(rng.normal(0, 0.010, distance.shape))
+    touches = contact_probability(_motion(distance, slip, speed, sigma=0.015), FPS) > 0.5
+    assert touches.any(1).all()
+    assert (touches != true).sum() <= 4
+
+
 def test_depth_in_a_resting_object_touches_and_a_gap_does_not():
     """30 frames 40 mm deep, a pass at 30 mm, and 45 frames three standard deviations away."""
     assert (contact_probability(_motion(np.full((30, 1), -0.04), 0.0, 0.0), FPS) > 0.9).all()

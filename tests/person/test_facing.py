@@ -41,6 +41,7 @@ SIX = slice(4, 10)
     [
         [(SIX, (0, 2, 4), ALL)],  # three views against three
         [(SIX, (0, 2, 3, 4), ALL)],
+        [(slice(None), (0, 2, 3, 4), ALL)],  # the person is seen from behind by most cameras
         [(SIX, range(6), ALL)],
         [(slice(0, 5), range(6), ALL)],  # from the beginning on
         [(slice(0, 11), range(6), ALL)],  # most of the time
@@ -57,6 +58,18 @@ def test_exchanged_people_and_limbs_are_put_back(clean, exchanges):
     fixed, error = corrected(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
     assert error.max() < 0.03
+
+
+@pytest.mark.parametrize("views", [(0, 2, 3, 4), (0, 1, 2, 3, 4), range(6)])
+def test_views_from_behind_have_the_right_sides_without_a_face(clean, views):
+    """The detector takes backs for fronts, and reports no face in these views."""
+    damaged = clean.copy()
+    for c in views:
+        damaged[:, c] = swap_sides(damaged[:, c], ALL)
+        damaged[:, c, 67:, 2] = damaged[:, c, [0, 15, 16], 2] = 0
+    _, error = corrected(damaged)
+    limbs = np.r_[ARMS, LEGS, HANDS]  # the ears alone do not tell their sides
+    assert np.nanmax(error.reshape(SETS, 135)[:, limbs]) < 0.03
 
 
 def test_partners_are_an_involution():
