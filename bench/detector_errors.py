@@ -1,6 +1,8 @@
 """Errors of 2D keypoints against the truth of virtual recordings: a real or a simulated detector.
 
-    python -m bench.detector_errors SETTINGS [--sequences NAME ...]
+    python -m bench.detector_errors SETTINGS [--sequences NAME ...] [--studio SETTINGS]
+
+``--studio`` names the settings whose studio made the recordings, if these are other ones.
 
 The true keypoints are projected at the true time of each image. Errors are converted to
 millimetres at the point's depth. Each group of points has one row:
@@ -61,14 +63,15 @@ class DetectorErrors:
     """Frame sets per second."""
 
 
-def measure(project: Project, sequence: str) -> DetectorErrors:
+def measure(project: Project, sequence: str, made_by: Project) -> DetectorErrors:
     """Compare the detections artefact of a virtual recording with its true keypoints.
 
-    Raises UserError if the studio did not make the recording, or if it has no detections yet.
+    The studio of ``made_by`` made the recording. Raises UserError if it did not, or if there are no
+    detections yet.
     """
-    studio = project.config.studio
+    studio = made_by.config.studio
     if studio is None or sequence not in studio.captures:
-        raise UserError(f"{project.path}: sequence {sequence!r} is not made by the studio")
+        raise UserError(f"{made_by.path}: sequence {sequence!r} is not made by the studio")
     path = project.artefact(sequence, "detections")
     if not path.is_file():
         raise UserError(f"{path}: is missing; run the project to stage 'detections' first")
@@ -184,11 +187,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("settings", type=Path)
     parser.add_argument("--sequences", nargs="+", default=())
+    parser.add_argument("--studio", type=Path)
     options = parser.parse_args()
     with exit_on_user_error():
         project = load_project(options.settings)
         names = list(options.sequences) or list(project.sequences)
-        recordings = [measure(project, name) for name in names]
+        made_by = load_project(options.studio or options.settings)
+        recordings = [measure(project, name, made_by) for name in names]
     table = Table("points", *COLUMNS, box=None, title=f"{options.settings}, mm")
     for name, points in groups().items():
         row = figures(recordings, points)

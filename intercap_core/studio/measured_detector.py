@@ -56,7 +56,7 @@ class Errors(NamedTuple):
 
 # Measured with `python -m bench.detector_errors` (bench/RESULTS.md), see the header
 ERRORS = {
-    "head": Errors(30, 6, 0.1, 15),
+    "head": Errors(31, 8, 0.1, 20),
     "shoulders": Errors(33, 10, 0.1, 15),
     "elbows": Errors(25, 12, 0.1, 65, 3.5, -1.6),
     "wrists": Errors(22, 12, 0.1, 90, 3.0, -1.6),
