@@ -8,14 +8,16 @@ measured of MediaPipe (:mod:`intercap_core.studio.measured_detector`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
 
 from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
@@ -30,7 +32,9 @@ from intercap_core.commands.evaluate.part import (
     with_spread,
 )
 from intercap_core.commands.evaluate.sequences import areas
+from intercap_core.evaluation.field_errors import stated_displacement
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.truth import match_times
 from intercap_core.evaluation.verdict.figures import TRUE, StatedError, stated_errors
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -51,6 +55,33 @@ FIGURES = {
 }
 
 
+class TrueAndStated(NamedTuple):
+    """Absolute errors (N,) and their stated standard deviations (N,); NaN = unknown."""
+
+    error: np.ndarray
+    sigma: np.ndarray
+
+    def rms(self) -> tuple[float, float]:
+        """Root mean square of the errors, and of the standard deviations, where both are known."""
+        known = np.isfinite(self.error) & np.isfinite(self.sigma)
+        if not known.any():
+            return float("nan"), float("nan")
+        error, sigma = (float(np.sqrt(np.mean(np.square(values[known])))) for values in self)
+        return error, sigma
+
+
+@dataclass(frozen=True, eq=False)
+class RigErrors:
+    """Errors of the cameras' estimates; poses and offsets of all cameras but the master."""
+
+    pose_mm: TrueAndStated
+    """Displacement of the points of a cube around the people."""
+    offset_ms: TrueAndStated
+    """Time offset relative to the master."""
+    depth_bias_mm: TrueAndStated
+    """Depth bias of each camera, the master's included."""
+
+
 @dataclass(frozen=True, eq=False)
 class DetectorSequence:
     """Errors of one recording."""
@@ -58,13 +89,15 @@ class DetectorSequence:
     metrics: SequenceMetrics
     slip_m: list[float]
     """Slip of each grip, see :func:`grip_slips`."""
+    rig: RigErrors
+    """Errors of the cameras after ``joint``."""
 
 
 DetectorSequences = Measured[DetectorSequence]
 
 
 def measure(project: Project, sequence: str) -> DetectorSequence:
-    """Read the metrics of one recording and measure the slip of its grips.
+    """Read the metrics of one recording, and measure its cameras and the slip of its grips.
 
     Raises UserError if an artefact or the truth cannot be read.
     """
@@ -75,7 +108,33 @@ def measure(project: Project, sequence: str) -> DetectorSequence:
     entry = project.object_of(sequence)
     assert entry is not None  # the recordings of this part have objects
     symmetry = SymmetryGroup.from_settings(entry.symmetry)
-    return DetectorSequence(metrics, _slips_of(paths.joint, truth, times, metrics.fps, symmetry))
+    slips = _slips_of(paths.joint, truth, times, metrics.fps, symmetry)
+    with artefacts.read(paths.joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
+        return DetectorSequence(metrics, slips, rig_errors(fitted, true))
+
+
+def rig_errors(
+    fitted: Artefact | Mapping[str, Any], true: Artefact | Mapping[str, Any]
+) -> RigErrors:
+    """Compare the cameras of a joint artefact with the truth, whose first camera is the master."""
+    names, true_names = ([str(n) for n in a["camera_names"]] for a in (fitted, true))
+    order, master = [true_names.index(name) for name in names], names.index(true_names[0])
+    others = np.arange(len(names)) != master
+    covariance = fitted["camera_covariance"]
+    moved = displacement(fitted["master_from_colour"], true["master_from_colour"][order], master)
+    late = fitted["time_offset"] - true["time_offset"][order]
+    bias = fitted["depth_bias"] - true["depth_bias"][order]
+    bias_sigma = np.sqrt([covariance[c, 6, c, 6] for c in range(len(names))])
+    return RigErrors(
+        TrueAndStated(
+            1e3 * moved[others],
+            1e3 * stated_displacement(fitted["master_from_colour"], covariance)[others],
+        ),
+        TrueAndStated(
+            1e3 * np.abs(late - late[master])[others], 1e3 * fitted["time_offset_sigma"][others]
+        ),
+        TrueAndStated(1e3 * np.abs(bias), 1e3 * bias_sigma),
+    )
 
 
 def _slips_of(
@@ -132,6 +191,11 @@ def figures(recordings: Sequence[DetectorSequence]) -> Figures:
     slips = [slip for recording in recordings for slip in recording.slip_m]
     if slips:
         result["grip_slip_mm"] = 1e3 * float(np.mean(slips))
+    for name in (f.name for f in fields(RigErrors)):
+        every = [getattr(recording.rig, name) for recording in recordings]
+        pooled = TrueAndStated(*(np.concatenate(values) for values in zip(*every, strict=True)))
+        quantity, _, unit = name.rpartition("_")
+        result[f"{quantity}_true_{unit}"], result[f"{quantity}_stated_{unit}"] = pooled.rms()
     return result | {f"verdict_{key}": value for key, value in found["verdict"].items()}
 
 
@@ -157,13 +221,18 @@ def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
             digits = (2 if "f1" in column else 1 for column in columns)
             table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
         console_of(160).print(table)
-        table = Table("recording", *TRUE, box=None)
-        table.title = f"{found.dataset}: true error, stated error and its 80 % range, mm"
+        table = Table("recording", *TRUE, *(f.name for f in fields(RigErrors)), box=None)
+        table.title = (
+            f"{found.dataset}: true error, stated error and its 80 % range, mm; cameras: RMS of "
+            "error and standard deviation"
+        )
         table.caption = "* the true error is outside the range"
         for recording in found.errors:
             stated = {error.part: error for error in stated_errors(recording.metrics)}
             cells = (statement(stated[part]) if part in stated else "" for part in TRUE)
-            table.add_row(recording.metrics.name, *cells)
+            rig = (getattr(recording.rig, f.name).rms() for f in fields(RigErrors))
+            rms = (f"{number(true, 1)}: {number(sigma, 1)}" for true, sigma in rig)
+            table.add_row(recording.metrics.name, *cells, *rms)
         console_of(160).print(table)
         for name in found.missing:
             print(f"{found.dataset}: {name}: no metrics")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from intercap_core.commands.evaluate.constants import count_constants, total_constants
-from intercap_core.commands.evaluate.detector import grip_slips, statement
+from intercap_core.commands.evaluate.detector import grip_slips, rig_errors, statement
 from intercap_core.commands.evaluate.run import evaluate
 from intercap_core.errors import UserError
 from intercap_core.evaluation.verdict.figures import StatedError
@@ -60,6 +60,30 @@ def test_the_twins_differ_in_their_keypoints_only() -> None:
         same = real.sequences[name]
         assert row.keypoints != same.keypoints
         assert row.model_copy(update={"keypoints": same.keypoints}) == same
+
+
+def test_cameras_are_compared_by_name_and_relative_to_the_master() -> None:
+    """Truth has the master k1 first; the fit lists k2 first. k2 is 4 mm off, 3 ms late."""
+    poses = np.stack([np.eye(4)] * 2)
+    poses[1, :3, 3] = (0.0, 0.0, 2.0)
+    true = {
+        "camera_names": np.array(["k1", "k2"]), "master_from_colour": poses,
+        "time_offset": np.array([0.001, 0.002]), "depth_bias": np.array([0.005, np.nan]),
+    }  # fmt: skip
+    moved = poses[::-1].copy()
+    moved[0, 0, 3] += 0.004
+    covariance = np.zeros((2, 7, 2, 7))
+    covariance[0, 3:6, 0, 3:6] = 0.002**2 * np.eye(3)
+    covariance[1, 6, 1, 6] = 0.003**2
+    fitted = {
+        "camera_names": np.array(["k2", "k1"]), "master_from_colour": moved,
+        "time_offset": np.array([0.006, 0.002]), "time_offset_sigma": np.array([0.001, 0.0]),
+        "depth_bias": np.array([np.nan, 0.003]), "camera_covariance": covariance,
+    }  # fmt: skip
+    rig = rig_errors(fitted, true)
+    assert rig.pose_mm.rms() == pytest.approx((4.0, 2.0 * np.sqrt(3)))
+    assert rig.offset_ms.rms() == pytest.approx((3.0, 1.0))
+    assert rig.depth_bias_mm.rms() == pytest.approx((2.0, 3.0))
 
 
 def test_constants_are_names_in_capitals_with_numbers() -> None:
