@@ -226,7 +226,7 @@ class ExportSettings(Model):
     """Exported formats. contact = contact probability by frame, vertices in contact, and a draft
     annotation; meshes = body and object of each frame as mesh files of half a megabyte each."""
     frame: Literal["z-up", "camera"] = "z-up"
-    """Coordinate frame of amass, glb and meshes: z-up = gravity-aligned with the ground at z = 0;
+    """Coordinate frame of amass, glb and meshes: z-up = z against gravity, ground at z = 0;
     camera = the master camera. The formats intercap, bop and coco use camera frames."""
     mesh_format: Literal["ply", "obj"] = "ply"
     """File format of the meshes; only ply marks the vertices in contact."""

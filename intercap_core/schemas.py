@@ -131,7 +131,8 @@ SCENE = Schema(
     },
     optional_attributes={
         "ground_note": "doubts about the floor or the stated up direction, in words; absent without doubts",
-        "up_source": "source of the up direction if no floor is known: 'gravity' sensors, 'stated' with the calibration, or 'cameras' (mean up direction of the cameras)",
+        "up_source": "source of the up direction: the normal of a measured or annotated 'floor', 'stated' with the calibration, or those that were combined, joined by ', ': 'gravity' sensors, 'cameras' (taken to be level), 'feet' on one plane, 'balance' of the standing person",
+        "up_deviation_deg": "standard deviation of the angle between the estimated and the true up direction, degrees",
     },
     fields={
         **_CAMERA_MODELS,

@@ -243,32 +243,36 @@ def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.n
     return result
 
 
+def standing_on_floor(feet: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, str]:
+    """Foot points (S, 3) that stand on the floor, and a note on other levels.
+
+    The lowest foot point of each set is taken to stand. If feet stand on several levels (a beam,
+    stairs), the lowest level with enough sets is the floor.
+
+    Args:
+        feet: (T, F, 3) heels and toes, master frame, metres; NaN = unknown.
+        up: (3,) approximate up direction.
+    """
+    standing = _standing(feet, up)
+    if len(standing) < MIN_FOOT_SETS:
+        return standing[:0], ""
+    sloping = _one_slope(standing, up) is not None
+    inlier, note = _one_level(standing, up, sloping=sloping)
+    return standing[inlier], note
+
+
 def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
     """Floor under standing feet, for scenes whose floor no camera measures.
 
-    - The lowest foot point of each set is taken to stand on the floor. If feet stand on several
-      levels (a beam, stairs), the lowest level with enough sets is the floor.
-    - The normal is measured gravity or a stated up, if there is one. Else it is fitted to the feet.
-      A walk along a line determines only the tilt along the line; across it, ``up`` is kept.
-    - The height is as accurate as the keypoints, one to two centimetres.
-
-    ``feet``: (T, F, 3) heels and toes, master frame, metres; NaN = unknown.
+    Its normal is ``up``. Its height is as accurate as the keypoints, one to two centimetres.
+    ``feet``: see :func:`standing_on_floor`.
     """
-    standing = _standing(feet, up.direction)
-    if len(standing) < MIN_FOOT_SETS:
-        return NO_GROUND
-    slope = _one_slope(standing, up.direction)
-    inlier, note = _one_level(standing, up.direction, sloping=slope is not None)
-    standing = standing[inlier]
+    standing, note = standing_on_floor(feet, up.direction)
     if len(standing) < MIN_FOOT_SETS:
         return NO_GROUND
     point, normal = np.median(standing, 0), up.direction
-    if up.source == "cameras":
-        own = _normal_of(standing, up.direction)
-        if own is None:
-            return NO_GROUND
-        point, normal = standing.mean(0), own
-    elif up.source == "stated" and slope is not None:
+    slope = _one_slope(_standing(feet, up.direction), up.direction)
+    if up.source == "stated" and slope is not None:
         off = degrees_between(slope, normal)
         if off > 6.0:  # twice the accuracy of a tilt by feet
             odd = f"the plane of the standing feet is {off:.0f} degrees from the stated up"

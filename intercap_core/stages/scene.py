@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from intercap_core.scene.ground import (
     describe_raised_feet,
     fit_ground,
     fit_ground_to_feet,
+    standing_on_floor,
     stated_ground,
     zup_from_master,
 )
@@ -39,9 +40,17 @@ from intercap_core.scene.surfaces import (
     moving_surfaces,
 )
 from intercap_core.scene.up import (
+    ANNOTATED_POINT_M,
+    FLOOR_DEG,
+    FOOT_PLACE_M,
+    STATED_DEG,
     UpDirection,
+    balance_levels,
+    camera_levels,
     check_stated_up,
     compare_with_stated,
+    estimate_up,
+    floor_levels,
     rough_up,
     trunk_direction,
 )
@@ -67,6 +76,8 @@ class _Scene:
     """Poses, biases and offsets."""
     ground: GroundPlane
     """The floor."""
+    up: UpDirection
+    """The up direction: the floor's normal, or without a floor an estimate."""
     ground_notes: list[str]
     """Notes on the floor and the stated up direction."""
     notes: list[list[str]]
@@ -134,15 +145,15 @@ def run(
         )
         rig = rig.moved(refined.poses)
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
-        ground, more_notes = _with_feet(source, rig, ground, subject)
-        slides, known_to = _slides(source, rig, refined, ground)
+        ground, up, more_notes = _with_feet(source, rig, ground, subject, floor)
+        slides, known_to = _slides(rig, refined, up.direction)
         notes = _notes(source, refined, moments, stated, exchanges)
         for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
             note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         ground_notes += more_notes
         scene = _Scene(
-            rig, backgrounds, moments, refined, ground, ground_notes, notes, slides, known_to
+            rig, backgrounds, moments, refined, ground, up, ground_notes, notes, slides, known_to
         )
         _write(output, source, scene, settings)
 
@@ -194,31 +205,58 @@ def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
 
 
 def _with_feet(
-    source: Frames, rig: Rig, ground: GroundPlane, subject: SubjectViews
-) -> tuple[GroundPlane, list[str]]:
-    """The floor, and notes about it.
+    source: Frames, rig: Rig, ground: GroundPlane, subject: SubjectViews, floor: Floor | None
+) -> tuple[GroundPlane, UpDirection, list[str]]:
+    """The floor, the up direction, and notes about the floor.
 
     A measured floor (``ground``) is kept. Otherwise it is the stated floor or, if the feet
-    contradict that or none is stated, the floor under the feet.
+    contradict that or none is stated, the floor under the feet. ``floor``: annotated floor points.
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
     toes_and_heels = slice(19, 25)
-    if not ground.found:
-        feet = triangulate_views(subject.keypoints, rig).joints[:, toes_and_heels]
-        ground = fit_ground_to_feet(feet, _up(source, rig))
+    if ground.found:
+        off = FLOOR_DEG
+        if floor is not None:
+            levels = floor_levels(np.array(floor, np.float64), ANNOTATED_POINT_M)
+            off = float(np.degrees(np.linalg.norm(levels[0].sigma))) if levels else np.nan
+        up = UpDirection(ground.normal, off, "floor", off)
+    else:
+        joints = triangulate_views(subject.keypoints, rig).joints
+        feet = joints[:, toes_and_heels]
+        up = _estimated_up(source, rig, joints, feet)
+        ground = fit_ground_to_feet(feet, up)
         if np.isfinite(stated[1]).all():
             denied = ground.found and compare_with_stated(
                 ground.point, ground.normal, *stated, middle
             )
-            ground = ground if denied else stated_ground(*stated)
+            if not denied:
+                ground = stated_ground(*stated)
+                up = UpDirection(stated[0], STATED_DEG, "stated", STATED_DEG)
     notes = [ground.note] if ground.note else []
     if ground.found and ground.source != "feet":
         above = describe_raised_feet(subject.joints[:, toes_and_heels], ground)
         notes += [above] if above else []
     if ground.found:
         notes += compare_with_stated(ground.point, ground.normal, *stated, middle)
-    return ground, notes
+    return ground, up, notes
+
+
+def _estimated_up(source: Frames, rig: Rig, joints: np.ndarray, feet: np.ndarray) -> UpDirection:
+    """Up direction without a measured floor: as stated, or by all evidence together.
+
+    ``joints`` (T, K, 3) and ``feet`` (T, 6, 3) of the person in the master's frame; NaN = unknown.
+    """
+    rough = _up(source, rig)
+    if rough.source == "stated":
+        return replace(rough, deviation_deg=STATED_DEG)
+    standing, _ = standing_on_floor(feet, rough.direction)
+    evidence = [
+        *camera_levels(rig, source.gravity),
+        *floor_levels(standing, FOOT_PLACE_M),
+        *balance_levels(joints),
+    ]
+    return estimate_up(rough, evidence)
 
 
 def _ground(
@@ -266,7 +304,6 @@ def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings)
     """Write the scene artefact; column 0 of ``pairs`` is background, column 1 moving surfaces."""
     rig, refined, ground = scene.rig, scene.refined, scene.ground
     pairs = refined.pairs
-    up = _up(source, rig)
     verdicts = [
         "; ".join(filter(None, both)) for both in zip(refined.verdicts, scene.known_to, strict=True)
     ]
@@ -284,11 +321,11 @@ def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings)
         ground_source=ground.source,
         ground_rms=ground.rms,
         ground_inliers=ground.inliers,
+        up_source=scene.up.source,
+        up_deviation_deg=scene.up.deviation_deg,
     ) as writer:
         if scene.ground_notes:
             writer.attributes["ground_note"] = "; ".join(scene.ground_notes)
-        if not ground.found:
-            writer.attributes["up_source"] = up.source
         for key, values in rig.datasets().items():
             writer.put(key, values)
         writer.put("present", source.present)
@@ -314,7 +351,7 @@ def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings)
         writer.put("image_of", scene.moments.image_of)
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
-        writer.put("zup_from_master", zup_from_master(ground, rig, up))
+        writer.put("zup_from_master", zup_from_master(ground, rig, scene.up))
         for camera, background in zip(rig, scene.backgrounds, strict=True):
             if background is not None:
                 writer.put(f"cameras/{camera.name}/background", background.depth)
@@ -371,17 +408,14 @@ def _notes(
     return notes
 
 
-def _slides(
-    source: Frames, rig: Rig, refined: Refinement, ground: GroundPlane
-) -> tuple[np.ndarray, list[str]]:
-    """Least determined displacement of each camera.
+def _slides(rig: Rig, refined: Refinement, up: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Least determined displacement of each camera; ``up``: (3,).
 
     Returns:
         Displacement (C, 3) of the rig's centre as seen by the camera, one standard deviation along
         the least determined direction, metres; 0 = fixed.
         Description of each; "" = fixed.
     """
-    up = ground.normal if ground.found else _up(source, rig).direction
     slides, words = np.zeros((len(rig), 3)), [""] * len(rig)
     for c, pose in enumerate(rig.master_from_colour):
         sigma, way = weakest_motion(refined.covariance[c, :, c], pose, ring_centre(rig))

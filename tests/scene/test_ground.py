@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scene.ground import (
     FOOT_HEIGHT_M,
@@ -16,23 +18,34 @@ from intercap_core.scene.ground import (
     describe_raised_feet,
     fit_ground,
     fit_ground_to_feet,
+    standing_on_floor,
     stated_ground,
     zup_from_master,
 )
 from intercap_core.scene.up import (
+    CAMERA_ROLL_DEG,
+    FOOT_PLACE_M,
+    LevelDirections,
+    UpDirection,
+    balance_levels,
+    camera_levels,
     check_stated_up,
     compare_with_stated,
     degrees_between,
+    estimate_up,
+    floor_levels,
     rough_up,
     trunk_direction,
 )
 from tests.helpers.synthetic_capture import ring
+from tests.helpers.synthetic_people import walking
 
 RIG, UP = ring()
 SOUTH, EAST, MASTER_UP = UP[:3, :3]  # axes of the room in the master's frame
 ORIGIN = invert(UP)[:3, 3]
 UNKNOWN = np.full(3, np.nan)
 NO_GRAVITY = np.full((6, 3), np.nan)
+OPPOSITE = Rig(RIG.cameras[::3])  # two cameras that look at each other
 GRAVITY = np.einsum("cji,j->ci", RIG.master_from_colour[:, :3, :3], -MASTER_UP)
 BY_GRAVITY, BY_CAMERAS = rough_up(RIG, GRAVITY), rough_up(RIG, NO_GRAVITY)
 HINTS = pytest.mark.parametrize("up", [BY_GRAVITY, BY_CAMERAS], ids=["gravity", "cameras"])
@@ -265,8 +278,7 @@ def test_unmeasured_floor_is_under_the_feet(up):
     angle, height = errors(ground)
     assert ground.source == "feet" and ground.note == "" and ground.inliers > 60
     assert angle < 0.5 and abs(height) < 0.01
-    still = np.repeat(feet[1:2], 40, 0)  # feet in one place show no tilt
-    assert fit_ground_to_feet(still, up).found == (up.source == "gravity")
+    assert fit_ground_to_feet(np.repeat(feet[1:2], 40, 0), up).found
     assert not fit_ground_to_feet(np.full_like(feet, np.nan), up).found
 
 
@@ -276,15 +288,64 @@ def test_tilted_hint_is_no_staircase():
     assert ground.found and ground.note == ""
 
 
+def up_of(rig: Rig, evidence: list[LevelDirections]) -> UpDirection:
+    """Up direction by the cameras and further evidence."""
+    return estimate_up(BY_CAMERAS, [*camera_levels(rig, NO_GRAVITY[: len(rig)]), *evidence])
+
+
 @pytest.mark.parametrize(
     ("axis", "limit_deg"), [(SOUTH, 2.5), (EAST, 0.5)], ids=["along", "across"]
 )
 def test_walk_along_a_line_shows_the_tilt_along_it(axis, limit_deg):
-    """The hint is 2 degrees off. About the line it stays, across it the feet decide."""
+    """The cameras are 2 degrees off. About the line they decide, across it the feet."""
     turn = tilted(axis, 2)
     feet = turn.apply(walk(80, bend=0).reshape(-1, 3)).reshape(80, 6, 3)
-    ground = fit_ground_to_feet(feet, BY_CAMERAS)
-    assert degrees_between(ground.normal, turn.apply(MASTER_UP)) < limit_deg
+    standing, _ = standing_on_floor(feet, BY_CAMERAS.direction)
+    up = up_of(RIG, floor_levels(standing, FOOT_PLACE_M))
+    assert up.source == "cameras, feet"
+    assert degrees_between(up.direction, turn.apply(MASTER_UP)) < limit_deg
+
+
+def rolled(rig: Rig, degrees: np.ndarray) -> Rig:
+    """Each camera turned about its optical axis."""
+    turns = np.tile(np.eye(4), (len(rig), 1, 1))
+    turns[:, :3, :3] = Rotation.from_euler("z", degrees[:, None], degrees=True).as_matrix()
+    return rig.moved(rig.master_from_colour @ turns)
+
+
+def test_stated_deviation_of_up_covers_rolls_and_odd_mounts():
+    """Cameras roll by 3 degrees; one stands on its side; two opposite ones leave an axis open."""
+    rng = np.random.default_rng(0)
+    ratios = []
+    for _ in range(50):
+        up = up_of(rolled(RIG, rng.normal(0, CAMERA_ROLL_DEG, 6)), [])
+        ratios.append(degrees_between(up.direction, MASTER_UP) / up.deviation_deg)
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+    on_its_side = up_of(rolled(RIG, np.array([0, 0, 90.0, 0, 0, 0])), [])
+    assert degrees_between(on_its_side.direction, MASTER_UP) < 1
+    assert up_of(OPPOSITE, []).deviation_deg > 10 > 3 > up_of(RIG, []).deviation_deg
+
+
+def test_standing_person_shows_up_and_a_sitting_one_does_not():
+    person = apply(invert(UP), walking(40, np.zeros(2), np.array([0.02, 0])))
+    levels = balance_levels(person)
+    assert levels[0].source == "balance" and np.abs(levels[0].directions @ MASTER_UP).max() < 0.15
+    two = up_of(OPPOSITE, levels)
+    assert degrees_between(two.direction, MASTER_UP) < 8 and two.deviation_deg < 8
+    legs = [KEYPOINT_NAMES.index(f"{s}_{p}") for s in ("left", "right") for p in ("knee", "ankle")]
+    above_knees = np.setdiff1d(np.arange(19), legs)
+    person[:, above_knees] += 0.43 * (SOUTH - MASTER_UP)  # length of the thigh
+    assert balance_levels(person) == []
+
+
+def test_gravity_sensors_outweigh_tilted_cameras():
+    """All cameras were calibrated with a tilt of 6 degrees against their own sensors' down."""
+    turn = tilted(SOUTH, 6)
+    evidence = camera_levels(RIG, np.einsum("cji,j->ci", RIG.master_from_colour[:, :3, :3],
+                                            turn.apply(-MASTER_UP)))  # fmt: skip
+    up = estimate_up(BY_CAMERAS, evidence)
+    assert up.source == "gravity, cameras"
+    assert degrees_between(up.direction, turn.apply(MASTER_UP)) < 2
 
 
 def test_stated_up_is_the_normal_and_compared_with_the_feet():

@@ -119,6 +119,8 @@ def test_without_depth_the_start_stays_and_feet_show_the_floor(tmp_path):
     run(paths)
     with artefacts.read(paths["output"], SCENE) as found:
         assert found.attributes["ground_source"] == "feet" and found.keys("cameras/") == []
+        assert found.attributes["up_source"] == "cameras, feet, balance"
+        assert 0.5 < found.attributes["up_deviation_deg"] < 4
         assert np.degrees(np.arccos(min(1, found["ground_normal"] @ UP[2, :3]))) < 3
         assert abs(apply(UP, found["ground_point"][None])[0, 2]) < 0.01
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.02
@@ -141,7 +143,7 @@ def test_stated_floor_is_used_unless_feet_contradict_it(tmp_path):
     paths = capture(tmp_path, TRUTH)
     agrees = ground_of(paths, **STATED)
     assert agrees["ground_source"] == "stated" and abs(agrees["height"]) < 1e-9
-    assert "ground_note" not in agrees and "as stated with the calibration" in agrees["frame"]
+    assert "ground_note" not in agrees and "up from the calibration, +-2" in agrees["frame"]
     denied = ground_of(paths, **STATED | {"stated_floor": ORIGIN + 0.4 * UP[2, :3]})
     assert denied["ground_source"] == "feet" and abs(denied["height"]) < 0.02
     assert "0.4" in denied["ground_note"] and "below the stated one" in denied["ground_note"]
@@ -162,8 +164,8 @@ def test_source_of_up_is_stated_without_a_floor(tmp_path):
     write_detections(paths["detections"], TRUTH, [[[] for _ in TRUTH] for _ in range(T)])
     by_cameras, stated = ground_of(paths), ground_of(paths, stated_up=UP[2, :3])
     assert by_cameras["up_source"] == "cameras" and stated["up_source"] == "stated"
-    assert "mean of the cameras" in by_cameras["frame"] and "no floor" in by_cameras["frame"]
-    assert "as stated with the calibration; no floor" in stated["frame"]
+    assert "cameras taken to be level" in by_cameras["frame"] and "no floor" in by_cameras["frame"]
+    assert "from the calibration, +-2.0 degrees; no floor" in stated["frame"]
 
 
 def test_missing_images_and_collinear_floors_are_rejected(tmp_path):

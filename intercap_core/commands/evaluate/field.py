@@ -35,7 +35,7 @@ from intercap_core.evaluation import field_errors, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project
-from intercap_core.schemas import FRAMES, JOINT, TRUTH
+from intercap_core.schemas import FRAMES, JOINT, SCENE, TRUTH
 from intercap_core.stages.export import MARKER
 from intercap_core.studio.subjects import Subject
 
@@ -47,6 +47,16 @@ _BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class UpError:
+    """Error of the up direction of a scene whose floor no surface shows."""
+
+    error_deg: float
+    """Angle between the estimated and the true up direction, degrees."""
+    stated_deg: float
+    """Stated standard deviation of the angle, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +72,8 @@ class FieldSequence:
     """Share of the images with a chosen person that show the subject."""
     exported_alone: bool
     """Whether the export has a body and no object."""
+    up: UpError | None
+    """Error of the up direction; None where a surface showed the floor."""
 
 
 FieldSequences = Measured[FieldSequence]
@@ -84,7 +96,19 @@ def measure(project: Project, sequence: str) -> FieldSequence:
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
     right = field_errors.measure_subject_share(paths.person, paths.scene, truth)
     alone = exported_alone(project.artefact(sequence, "export"))
-    return FieldSequence(metrics, own / known - 1, height, right, alone)
+    return FieldSequence(
+        metrics, own / known - 1, height, right, alone, up_error(paths.scene, truth)
+    )
+
+
+def up_error(scene: Path, truth: Path) -> UpError | None:
+    """Compare the up direction of a scene with the truth; None where a surface showed the floor."""
+    with artefacts.read(scene, SCENE) as found, artefacts.read(truth, TRUTH) as true:
+        if found.attributes["up_source"] == "floor":
+            return None
+        up, true_up = found["zup_from_master"][2, :3], true["ground_normal"]
+        stated = float(found.attributes["up_deviation_deg"])
+    return UpError(float(np.degrees(np.arccos(np.clip(up @ true_up, -1, 1)))), stated)
 
 
 def exported_alone(folder: Path) -> bool:
@@ -142,6 +166,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
                 unit = "mm_s" if key == "planted_speed" else "mm"
                 name = key.removeprefix("body_").removesuffix("_speed")
                 found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
+    found |= _of_up([e.up for some in evaluations for e in some.errors if e.up is not None])
     several = [found for found in evaluations if found.dataset == PASSER_BY]
     if several:
         shares = [e.subject_right for some in several for e in some.errors]
@@ -155,6 +180,21 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
         count = len(whole) + sum(len(some.missing) for some in alone)
         found["field.people_alone_share"] = sum(whole) / count
     return found
+
+
+def _of_up(errors: Sequence[UpError]) -> Figures:
+    """Mean error of the up direction, its stated deviation, and the largest ratio of the two."""
+    if not errors:
+        return {}
+    off, stated = (
+        np.array([getattr(e, name) for e in errors]) for name in ("error_deg", "stated_deg")
+    )
+    return {
+        "field.up_error_deg": float(off.mean()),
+        "field.up_error_worst_deg": float(off.max()),
+        "field.up_stated_deg": float(stated.mean()),
+        "field.up_error_over_stated_worst": float((off / stated).max()),
+    }
 
 
 def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
@@ -177,9 +217,9 @@ def _of_a_person_alone(sequence: FieldSequence) -> bool:
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
     """Print one row per recording: true and stated errors, bone lengths, height."""
-    console = console_of(122)
+    console = console_of(138)
     heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
-             "bones %", "height mm", "subject %")  # fmt: skip
+             "bones %", "height mm", "subject %", "up deg", "stated")  # fmt: skip
     table = Table("recording", *heads, box=None, title="the field, after metrics")
     for found in evaluations:
         for e in found.errors:
@@ -196,6 +236,11 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
                 number(100 * float(np.abs(e.bones).mean()), 1),
                 number(1e3 * e.height_m, 0),
                 number(100 * e.subject_right, 0),
+                *(
+                    ["", ""]
+                    if e.up is None
+                    else [number(e.up.error_deg, 1), number(e.up.stated_deg, 1)]
+                ),
             )
         for name in found.missing:
             table.add_row(f"{found.dataset}: {name}", "no metrics")

@@ -19,12 +19,13 @@ from intercap_core.config import BodyModels
 from intercap_core.schemas import JOINT
 
 METRES = "metres, radians, seconds"
-_FLOOR = "z-up: gravity-aligned, ground at z = 0, metres"
-_STATED_FLOOR = "z-up: up and ground at z = 0 as stated with the calibration, metres"
 _UP_SOURCE = {
-    "gravity": "by the gravity sensors",
-    "stated": "as stated with the calibration",
-    "cameras": "by the mean of the cameras' own up, which may be tilted",
+    "floor": "the floor",
+    "gravity": "gravity sensors",
+    "stated": "the calibration",
+    "cameras": "cameras taken to be level",
+    "feet": "the standing person's feet",
+    "balance": "the standing person's balance",
 }
 
 
@@ -206,13 +207,25 @@ class Coordinates:
 
 def z_up_frame(scene: artefacts.Artefact) -> str:
     """Name the z-up frame of a scene artefact, with the source of its floor and vertical."""
-    attributes = scene.attributes
-    if attributes["ground_found"]:
-        return _STATED_FLOOR if attributes["ground_source"] == "stated" else _FLOOR
-    source = _UP_SOURCE.get(
-        str(attributes.get("up_source")), "by a hint that the scene does not name"
-    )
-    return f"z-up: {source}; no floor is known, z = 0 at the master camera, metres"
+    zero = "ground at z = 0"
+    if not scene.attributes["ground_found"]:
+        zero = "no floor is known, z = 0 at the master camera"
+    return f"z-up: {describe_up(scene)}; {zero}, metres"
+
+
+def describe_up(scene: artefacts.Artefact) -> str:
+    """Source of a scene's up direction and its standard deviation, in words.
+
+    It is "gravity-aligned" only if gravity was measured or a floor was seen.
+    """
+    sources = str(scene.attributes.get("up_source", "")).split(", ")
+    if not sources[0]:
+        return "up from a source that the scene does not name"
+    names = [_UP_SOURCE.get(source, source) for source in sources]
+    words = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    off = float(scene.attributes.get("up_deviation_deg", np.nan))
+    measured = "gravity-aligned by" if {"floor", "gravity"} & {*sources} else "up from"
+    return f"{measured} {words}" + (f", +-{off:.1f} degrees" if np.isfinite(off) else "")
 
 
 def rounded_lists(values: np.ndarray, digits: int) -> Any:

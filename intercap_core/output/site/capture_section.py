@@ -12,6 +12,7 @@ from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.evaluation import flags
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.output.export.motion import describe_up
 from intercap_core.output.site import charts, embed
 from intercap_core.output.site.capture_pictures import (
     CAMERA_COLOURS,
@@ -150,14 +151,14 @@ def _count_images(states: Sequence[str]) -> int:
 def _ground(scene: artefacts.Artefact) -> str:
     stated = scene.attributes
     if not stated["ground_found"]:
-        source = stated.get("up_source", "a hint")
-        text = f"no floor was found or annotated, vertical by {source}"
+        text = "no floor was found or annotated"
     elif stated["ground_source"] == "stated":
         text = "as stated with the calibration"
     else:
         text = f"{stated['ground_source']}, {int(stated['ground_inliers']):,} supporting points"
         rms = 1e3 * float(stated["ground_rms"])
         text += f", RMS {rms:.1f} mm" if np.isfinite(rms) else ""
+    text = f"{text}; {describe_up(scene)}"
     return f"{text}; {stated['ground_note']}" if "ground_note" in stated else text
 
 

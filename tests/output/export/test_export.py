@@ -195,9 +195,14 @@ def test_stated_errors_go_with_the_files(capture: fitted.Capture, everything: Pa
 @pytest.mark.parametrize(
     ("attributes", "words"),
     [
-        ({"up_source": "cameras"}, "mean of the cameras' own up"),
-        ({"up_source": "stated"}, "as stated with the calibration"),
-        ({"up_source": "gravity"}, "by the gravity sensors"),
+        ({"up_source": "cameras"}, "z-up: up from cameras taken to be level; "),
+        ({"up_source": "stated"}, "z-up: up from the calibration; "),
+        (
+            {"up_source": "cameras, feet, balance", "up_deviation_deg": 2.14},
+            "z-up: up from cameras taken to be level, the standing person's feet and the standing "
+            "person's balance, +-2.1 degrees; ",
+        ),
+        ({"up_source": "gravity, cameras"}, "z-up: gravity-aligned by gravity sensors and cameras"),
         ({}, "does not name"),  # scenes of earlier versions
     ],
 )
@@ -206,7 +211,8 @@ def test_without_a_floor_the_frame_names_the_source_of_up(
 ) -> None:
     scene: Any = SimpleNamespace(attributes={"ground_found": False} | attributes)
     name = z_up_frame(scene)
-    assert words in name and "no floor is known" in name and "gravity-aligned" not in name
+    assert words in name and "no floor is known" in name
+    assert ("gravity-aligned" in name) == ("gravity" in attributes.get("up_source", ""))
 
 
 def test_same_input_same_bytes(capture: fitted.Capture, everything: Path, tmp_path: Path) -> None:
