@@ -41,6 +41,7 @@ SAME_PERSON_PX_AT_1080P = 60.0
 # person beside a stool is split into two people in 17 instead of 8 of 45 frames.
 SAME_PERSON_GAP_M = 0.12
 
+MIN_DISTANCE_M = 0.3  # two people are at least as far apart
 NOBODY = -1  # index of a person in a view that does not see it
 
 _MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
@@ -76,20 +77,45 @@ class PersonGroup:
         """Coordinate-wise median (3,) of the known points, metres."""
         return np.nanmedian(self.points, 0)
 
-    def distance(self, other: PersonGroup) -> float:
-        """Return the distance of the person from ``other``, metres.
+    def shared_distance(self, other: PersonGroup) -> float:
+        """Median distance of the points that both groups know, metres; NaN with less than three.
 
-        It is the median distance of the points that both have. The sides of one may be exchanged.
-        The centre is that of the known points, which differ from set to set. It is compared only if
-        less than :data:`MIN_COMMON_POINTS` points are known in both.
+        Left and right may be exchanged in one of the groups. The median of three points, such as
+        the hips and their middle, tolerates one wrong point.
         """
         apart = np.linalg.norm(
             self.points - np.stack([other.points, other.points[_MIRRORED]]), axis=-1
         )
-        enough = np.isfinite(apart).sum(1) >= MIN_COMMON_POINTS
-        if enough.any():
-            return float(np.nanmedian(apart[enough], axis=1).min())
-        return float(np.linalg.norm(self.centre - other.centre))
+        enough = np.isfinite(apart).sum(1) >= 3
+        return float(np.nanmedian(apart[enough], axis=1).min()) if enough.any() else float("nan")
+
+    def distance(self, other: PersonGroup) -> float:
+        """:meth:`shared_distance`, or else the distance of the centres.
+
+        The centre is that of the known points, which differ from set to set.
+        """
+        apart = self.shared_distance(other)
+        return apart if np.isfinite(apart) else float(np.linalg.norm(self.centre - other.centre))
+
+    def shares_view(self, other: PersonGroup) -> bool:
+        """Whether a view shows both groups, as two detections."""
+        return bool(((self.members != NOBODY) & (other.members != NOBODY)).any())
+
+    def same_person(self, other: PersonGroup) -> bool:
+        """Whether two groups of one set may be one person, seen by different cameras."""
+        return not self.shares_view(other) and self.distance(other) < MIN_DISTANCE_M
+
+    def merged(self, other: PersonGroup) -> PersonGroup:
+        """One person from two groups of one set; the group with more support takes precedence."""
+        if other.support > self.support:
+            return other.merged(self)
+        free = self.members == NOBODY
+        return PersonGroup(
+            np.where(free, other.members, self.members),
+            np.where(np.isfinite(self.points), self.points, other.points),
+            self.support + other.support,
+            np.where(free, other.errors, self.errors),
+        )
 
     def without(self, views: np.ndarray) -> PersonGroup:
         """The same person without the detections of ``views`` (C,) bool."""
@@ -136,8 +162,8 @@ def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonG
         return groups
     result = []
     for other, both in zip(groups, shared, strict=True):
-        if both.any() and group.distance(other) < 0.3:
-            return groups  # the same person again: two people are at least 0.3 m apart
+        if both.any() and group.distance(other) < MIN_DISTANCE_M:
+            return groups  # the same person again
         worse = group.errors >= other.errors
         group = group.without(both & worse)
         result.append(other.without(both & ~worse))

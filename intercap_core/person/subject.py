@@ -19,6 +19,7 @@ from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
 from intercap_core.person.groups import (
+    MIN_DISTANCE_M,
     NOBODY,
     SAME_PERSON_PX_AT_1080P,
     Lift,
@@ -181,8 +182,7 @@ def _of_named(
             lost.append(detection)
             continue
         for other, before in chosen.values():
-            if other is not track and Person((other,)).meets(Person((track,))):
-                t = max(other.sets[0], track.sets[0])
+            if (t := _two_people(other, track)) is not None:
                 raise UserError(
                     f"{before.words} and {detection.words} name two people: both are seen at frame "
                     f"{t} ({times[t] - times[0]:.2f} s); keep the points that lie on one person"
@@ -194,6 +194,25 @@ def _of_named(
         "the person in a frame in which more cameras see it"
     )
     return [track for track, _ in chosen.values()], [doubt] if lost else []
+
+
+def _two_people(first: PersonTrack, second: PersonTrack) -> int | None:
+    """Set that shows two tracks as two people most clearly; None if they may be one person.
+
+    They are two people if their distance is too large in half of the shared sets. Without shared
+    points it is unknown, and two detections in one image decide.
+    """
+    if first is second:
+        return None
+    shared = Person((first,)).shared(Person((second,)))
+    apart = [
+        (np.inf if group.shares_view(other) else 0.0) if np.isnan(distance) else distance
+        for _, group, other in shared
+        for distance in [group.shared_distance(other)]
+    ]
+    if not apart or np.median(apart) <= MIN_DISTANCE_M:
+        return None
+    return shared[int(np.argmax(apart))][0]
 
 
 def _has(track: PersonTrack, named: NamedDetection) -> bool:

@@ -135,20 +135,29 @@ class Person:
     """Tracks of one person."""
 
     parts: tuple[PersonTrack, ...]
-    """Tracks without a common frame set, in order of their first sets. The sets of one may lie
-    between those of another."""
+    """Tracks in order of their first sets. The sets of one may lie between those of another. A
+    common set shows the person in different cameras."""
     doubts: tuple[str, ...] = ()
     """Messages on doubtful joins."""
 
     @cached_property
     def track(self) -> PersonTrack:
         """All parts as one track."""
-        groups = {t: g for part in self.parts for t, g in zip(part.sets, part.groups, strict=True)}
+        groups: dict[int, PersonGroup] = {}
+        for part in self.parts:
+            for t, group in zip(part.sets, part.groups, strict=True):
+                groups[t] = groups[t].merged(group) if t in groups else group
         return PersonTrack(sorted(groups), [groups[t] for t in sorted(groups)])
 
+    def shared(self, other: Person) -> list[tuple[int, PersonGroup, PersonGroup]]:
+        """Sets that show both, with the group of each."""
+        theirs = dict(zip(other.track.sets, other.track.groups, strict=True))
+        own = zip(self.track.sets, self.track.groups, strict=True)
+        return [(t, group, theirs[t]) for t, group in own if t in theirs]
+
     def meets(self, other: Person) -> bool:
-        """Whether a frame set shows both, so that they are certainly different people."""
-        return not set(self.track.sets).isdisjoint(other.track.sets)
+        """Whether a frame set shows the two as different people."""
+        return any(not group.same_person(theirs) for _, group, theirs in self.shared(other))
 
 
 def join_tracks(
@@ -160,8 +169,7 @@ def join_tracks(
 
     Args:
         times: (T,) seconds.
-        together: tracks of one person by the user's statement, without a common frame set. This
-            person is the first of the result.
+        together: tracks of one person by the user's statement; the first person of the result.
     """
     rest = [track for track in tracks if track not in together]
     people = [Person(_ordered(together))] if together else []
@@ -212,14 +220,13 @@ _Sighting = tuple[int, PersonGroup]  # frame set, and the person in it
 
 def _seams(first: Person, second: Person) -> list[tuple[_Sighting, _Sighting]]:
     """Pairs of successive sightings, in order of time, of which one belongs to each person."""
-    own = set(first.track.sets)
     sightings = [
-        sighting
-        for person in (first, second)
-        for sighting in zip(person.track.sets, person.track.groups, strict=True)
+        (t, k, group)
+        for k, person in enumerate((first, second))
+        for t, group in zip(person.track.sets, person.track.groups, strict=True)
     ]
-    sightings.sort(key=lambda sighting: sighting[0])
-    return [(a, b) for a, b in pairwise(sightings) if (a[0] in own) != (b[0] in own)]
+    sightings.sort(key=lambda sighting: sighting[:2])
+    return [((s, a), (t, b)) for (s, i, a), (t, k, b) in pairwise(sightings) if i != k]
 
 
 def _doubt(first: Person, second: Person, times: np.ndarray) -> tuple[str, ...]:

@@ -266,6 +266,45 @@ def test_points_on_two_people_at_once_are_refused(two_people):
         subject_of(two_people[0], named=named)
 
 
+def hide(people: list, person: int, sets: slice, parts: list[int], cameras=range(VIEWS)) -> None:
+    """The detector does not see ``parts`` of a person, in place."""
+    for row in people[sets]:
+        for c in cameras:
+            row[c][person][parts] = 0
+
+
+UPPER, LOWER = [*range(8), *range(15, 19)], [10, 11, 13, 14, *range(19, 25)]
+
+
+def test_named_person_is_followed_while_parts_are_hidden(tmp_path):
+    """The subject walks behind furniture and shows hips and legs, or hips and trunk, by turns."""
+    sets = 36
+    people = people_of(walking(sets, MIDDLE, STILL), walking(sets, ASIDE, STILL))
+    for first in range(0, sets, 12):
+        hide(people, 0, slice(first, first + 6), UPPER)
+        hide(people, 0, slice(first + 6, first + 12), LOWER)
+    detections = detections_of(tmp_path, people)
+    subject = subject_of(detections, named=name(detections, people, (0, 2, 1)))
+    assert (subject.people == 0).all() and not subject.doubts
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["by turns", "at once"])
+def test_two_points_on_one_person_join_its_tracks(tmp_path, together):
+    """The detector shows legs alone or trunk alone, by turns, or to different cameras at once."""
+    sets = 36
+    people = people_of(walking(sets, MIDDLE, STILL), walking(sets, ASIDE, STILL))
+    for k, part in enumerate(([*UPPER, 8, 9, 12], [*LOWER, 8, 9, 12])):
+        if together:
+            hide(people, 0, slice(12, sets), part, cameras=[k, k + 2, k + 4])
+        else:
+            for first in range(4 * k, sets, 8):
+                hide(people, 0, slice(first, first + 4), part)
+    detections = detections_of(tmp_path, people)
+    named = [NamedDetection(14, 0, 0, "subject[0]"), NamedDetection(17, 1, 0, "subject[1]")]
+    subject = subject_of(detections, named=named)
+    assert (subject.people == 0).mean() > 0.9 and (subject.people != 1).all()
+
+
 # --- after an absence ----------------------------------------------------------------------------
 
 
