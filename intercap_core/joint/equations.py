@@ -55,16 +55,21 @@ class BandedEquations:
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), or None if the matrix is not positive definite.
 
-        ``damping`` (T,) times ``damped`` is added to the diagonal. The step consumes ``bands`` to
-        save memory: another step needs new equations.
+        See :meth:`solve` for ``damping``.
+        """
+        return self.solve(damping, -self.gradient)
+
+    def solve(self, damping: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+        """The solution for one or k right-hand sides (T, n) or (T, n, k); None as in :meth:`step`.
+
+        ``damping`` (T,) times ``damped`` is added to the diagonal. The solution consumes ``bands``
+        to save memory: another one needs new equations.
         """
         matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
         damped = torch.from_numpy(damping[:, None] * self.damped)
         matrix[0].diagonal(dim1=1, dim2=2).add_(damped)
         factor = BandedSystem(matrix).factorise(in_place=True)
-        if factor is None:
-            return None
-        return factor.solve(-torch.from_numpy(self.gradient)).numpy()
+        return None if factor is None else factor.solve(torch.from_numpy(right)).numpy()
 
     @property
     def energy(self) -> dict[str, float]:

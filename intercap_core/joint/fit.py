@@ -22,7 +22,14 @@ from intercap_core.joint.geometry import Geometry, PosedGeometry
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
 from intercap_core.joint.problem import JointProblem, build_terms
-from intercap_core.joint.result import CARRIED, CONTRADICTED, Convergence, JointFit
+from intercap_core.joint.result import (
+    BODY_INSIDE,
+    CARRIED,
+    CONTRADICTED,
+    OBJECT_INSIDE,
+    Convergence,
+    JointFit,
+)
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.contact import Contact
@@ -274,8 +281,8 @@ def _flag_reasons(
         (flags.lost, lost),
         (flags.ambiguous & flags.carried, CARRIED),
         (flags.ambiguous & ~flags.carried, "object pose ambiguous"),
-        (deep, "body deep inside the object"),
-        (sunk, "object deep inside the body"),
+        (deep, BODY_INSIDE),
+        (sunk, OBJECT_INSIDE),
         *estimate.doubtful_frames(),
         (stalled, "no step of the joint fit lowered its energy"),
         (against_images, CONTRADICTED),

@@ -21,6 +21,8 @@ from intercap_core.schemas import JOINT
 
 # Reasons of a flag that later stages search for.
 CONTRADICTED = "the images contradict the object's pose"
+BODY_INSIDE = "body deep inside the object"
+OBJECT_INSIDE = "object deep inside the body"
 CARRIED = "object not seen, carried from annotated poses"
 
 
@@ -65,6 +67,8 @@ class JointResult:
     time_offset: np.ndarray  # (C,) time offsets of the cameras, seconds
     flagged: np.ndarray  # (T,) frames not to be trusted
     contradicted: np.ndarray  # (T,) frames whose images contradict the object's pose
+    penetrating: np.ndarray  # (T,) frames in which body and object are deep inside each other
+    camera_covariance: np.ndarray  # (C, 7, C, 7) of the cameras, see :mod:`.cameras`
 
     @classmethod
     def read(cls, path: Path, scene: Artefact) -> JointResult:
@@ -78,6 +82,7 @@ class JointResult:
                 joint["translation"].astype(float),
             )
             rig = Rig.from_artefact(scene).moved(joint["master_from_colour"])
+            reasons = joint.text("flag_reason")
             return cls(
                 state,
                 joint["contact_probability"].astype(float),
@@ -85,5 +90,7 @@ class JointResult:
                 Cameras(rig, joint["depth_bias"]),
                 joint["time_offset"],
                 joint["flagged"],
-                np.array([CONTRADICTED in reason for reason in joint.text("flag_reason")]),
+                np.array([CONTRADICTED in reason for reason in reasons]),
+                np.array([BODY_INSIDE in r or OBJECT_INSIDE in r for r in reasons]),
+                joint["camera_covariance"],
             )

@@ -233,6 +233,9 @@ def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
             rig = (getattr(recording.rig, f.name).rms() for f in fields(RigErrors))
             rms = (f"{number(true, 1)}: {number(sigma, 1)}" for true, sigma in rig)
             table.add_row(recording.metrics.name, *cells, *rms)
+        row = figures(found.errors)
+        shares = (number(row.get(f"verdict_coverage_{part}"), 2) for part in TRUE)
+        table.add_row("share in the range", *shares)
         console_of(160).print(table)
         for name in found.missing:
             print(f"{found.dataset}: {name}: no metrics")
@@ -244,7 +247,7 @@ def statement(error: StatedError) -> str:
     if not np.isfinite(error.stated):
         return f"{true}: none stated" if true else ""
     low, high = error.stated / error.factor, error.stated * error.factor
-    mark = "" if not true or low <= error.true <= high else "*"
+    mark = "" if not true or error.covers else "*"
     return f"{true}{mark}: {error.stated:.1f} ({low:.1f} to {high:.1f})"
 
 

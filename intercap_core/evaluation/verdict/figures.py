@@ -111,6 +111,11 @@ class StatedError:
     repeated: float = float("nan")
     """Displacement if the images of every other frame are not used, millimetres."""
 
+    @property
+    def covers(self) -> bool:
+        """Whether the true error is within the stated range; False if either is unknown."""
+        return self.stated / self.factor <= self.true <= self.stated * self.factor
+
 
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
     """Stated errors of every part; empty if the metrics have no verdict."""
@@ -192,6 +197,8 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
       each part, and the mean of the parts.
     - ``within_factor_share``: share of items whose stated error is within the factor WITHIN of the
       true error.
+    - ``coverage_<part>``: share of sequences whose true error is within the stated range.
+    - ``range_factor_<part>``: median of the factor of that range.
     - ``bad_sequences``: number of items with a true error above 20 mm.
     - ``bad_sequence_recall``: share of these whose stated error is above 20 mm too.
     """
@@ -205,6 +212,9 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     ranks = []
     for part in TRUE:
         own = [e for e in stating if e.part == part]
+        if own:
+            result[f"coverage_{part}"] = float(np.mean([e.covers for e in own]))
+            result[f"range_factor_{part}"] = float(np.median([e.factor for e in own]))
         if len(own) > 2:
             rank = float(spearmanr([e.stated for e in own], [e.true for e in own]).statistic)
             result[f"rank_correlation_{part}"] = rank

@@ -1,4 +1,4 @@
-"""Held-out evaluation of a joint fit: one camera at a time, and every other frame.
+"""Held-out evaluation of a joint fit: one camera at a time, all depth, and every other frame.
 
 The energy of the joint fit is a sum of terms with images, one part for each camera, and of terms
 without images. At the result x it has the gradient g and the Gauss-Newton matrix H; g_c and H_c are
@@ -9,6 +9,10 @@ the parts of camera c. The fit without this camera is, to first order,
 The last term subtracts the step that the full problem itself would still make. Correspondences,
 robust weights and contact are kept from x, so that a refit costs one linear solve. A refit iterated
 to convergence with new correspondences would move the body 4 to 10 % further.
+
+The cameras are fixed in these refits. Corrections d of the cameras (:mod:`intercap_core.joint.
+cameras`) with the covariance S that the joint fit states move the fit by -H^-1 H_xd d, so that its
+covariance grows by J S J^T with J = H^-1 H_xd. This part of the error is the same in all frames.
 """
 
 from __future__ import annotations
@@ -21,13 +25,21 @@ import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.body import BODY_JOINTS, BOTH_HANDS
+from intercap_core.evaluation.body import BOTH_HANDS
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
-from intercap_core.joint.state import BODY, OBJECT, State
+from intercap_core.joint.state import (
+    ALL,
+    BODY,
+    OBJECT,
+    OBJECT_SHIFT,
+    OBJECT_TURN,
+    State,
+    frame_chunks,
+)
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
@@ -42,13 +54,22 @@ class JudgedPart(StrEnum):
     OBJECT = "object"
 
 
+SURFACE = 1
+"""Index of surface points (depth, rims of the person's masks) in the last axis of masks (T, C, 2)
+of the images that are used. Index 0 is that of keypoints and of the object's silhouettes."""
+
+
 class Refits:
     """Refits around one ``state`` with subsets of the images.
 
     The terms of ``assembly`` must have been refreshed (linearised) at this state.
+
+    Attributes:
+        displaced: (T, 174, k) steps of the fit to all images by k further gradients.
     """
 
-    def __init__(self, assembly: Assembly, state: State) -> None:
+    def __init__(self, assembly: Assembly, state: State, gradients: np.ndarray) -> None:
+        """``gradients`` (T, 174, k) are added in turn to that of the energy."""
         self.state = state
         self._seen: list[tuple[slice, BodyData | ObjectData | ObjectImagesData]] = [
             (BODY, assembly.body)
@@ -60,26 +81,93 @@ class Refits:
             if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)
         self._bands = np.empty_like(self._rest.bands)
-        every = np.ones((len(state), len(assembly.body.time_offset)), bool)
-        self._descent = self._step(every)
+        everything = np.ones((len(state), len(assembly.body.time_offset), 2), bool)
+        solution = self._solve(everything, gradients)
+        self._descent, self.displaced = solution[..., 0], solution[..., 1:]
 
-    def with_views(self, used: np.ndarray) -> State:
-        """The state fitted to the images in the mask ``used`` (T, C)."""
-        return self.state.moved(limited(self._step(used) - self._descent))
+    def with_images(self, used: np.ndarray) -> State:
+        """The state fitted to the images in the mask ``used`` (T, C, 2)."""
+        return self.state.moved(limited(self._solve(used)[..., 0] - self._descent))
 
-    def _step(self, used: np.ndarray) -> np.ndarray:
-        """Gauss-Newton step with the images in the mask ``used`` (T, C); NaN if it is singular."""
+    def _solve(self, used: np.ndarray, gradients: np.ndarray | None = None) -> np.ndarray:
+        """Gauss-Newton step with the images ``used``, then those of ``gradients`` alone.
+
+        The shape is (T, 174, 1 + k). NaN if the matrix is singular.
+        """
         equations = self._rest.copy(self._bands)
         for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.linearise_views(used, self.state))
-        step = equations.step(np.full(len(self.state), 1e-6))  # the least damping of the fit
-        if step is None:  # some parameter is not determined
-            return np.full(self._rest.gradient.shape, np.nan)
-        return step
+        right = -equations.gradient[..., None]
+        if gradients is not None:
+            right = np.concatenate([right, -gradients], axis=2)
+        solution = equations.solve(np.full(len(self.state), 1e-6), right)  # least damping of a fit
+        return np.full(right.shape, np.nan) if solution is None else solution
 
 
-# Joints (slices of the 55) by which body and hands are compared.
-JOINTS = {JudgedPart.BODY: BODY_JOINTS, JudgedPart.HANDS: BOTH_HANDS}
+class JudgedPoints:
+    """Points by which each part is compared: joints, or the object's centre of mass.
+
+    Attributes:
+        weights: (K,) by part, sum to 1. Joints of the body weigh as the share of the skin that
+            follows them, those of the hands alike.
+    """
+
+    def __init__(self, inputs: JointInputs) -> None:
+        self._inputs = inputs
+        skin = inputs.model.skinning_weights.double().mean(0).numpy()
+        fingers = np.zeros(len(skin))
+        fingers[BOTH_HANDS] = 1
+        self.weights = {
+            JudgedPart.BODY: skin / skin.sum(),
+            JudgedPart.HANDS: fingers / fingers.sum(),
+        }
+        if inputs.geometry.has_object:
+            self.weights[JudgedPart.OBJECT] = np.ones(1)
+
+    def at(self, state: State) -> dict[JudgedPart, np.ndarray]:
+        """Points (T, K, 3) of each part, metres."""
+        model = self._inputs.model
+        with torch.no_grad():
+            posed = model(state.parameters(model), vertex_ids=np.array([0]))
+        joints = posed.joints.double().numpy()
+        found = {JudgedPart.BODY: joints, JudgedPart.HANDS: joints}
+        if JudgedPart.OBJECT in self.weights:
+            found[JudgedPart.OBJECT] = (self._arm(state) + state.translation)[:, None]
+        return found
+
+    def along(self, state: State, steps: np.ndarray) -> dict[JudgedPart, np.ndarray]:
+        """Root sum of squares (T,) of the displacements of a part by ``steps`` (T, 174, k)."""
+        model = self._inputs.model
+        square = np.empty((len(state), len(self.weights[JudgedPart.BODY])))
+        parameters = state.parameters(model)
+        for frames in frame_chunks(len(state)):
+            lin = model.linearise(parameters.frames(frames), vertex_ids=np.array([0]), joints=True)
+            jacobian = lin.full()[:, 1:, :, BODY].double().numpy()
+            moved = np.einsum("tjxn,tnk->tjxk", jacobian, steps[frames, BODY], optimize=True)
+            square[frames] = (moved**2).sum(axis=(2, 3))
+        found = {
+            part: np.sqrt(square @ self.weights[part])
+            for part in (JudgedPart.BODY, JudgedPart.HANDS)
+        }
+        if JudgedPart.OBJECT in self.weights:
+            moved = steps[:, OBJECT_SHIFT] + np.cross(
+                steps[:, OBJECT_TURN], self._arm(state)[..., None], axis=1
+            )
+            found[JudgedPart.OBJECT] = np.sqrt((moved**2).sum(axis=(1, 2)))
+        return found
+
+    def apart(
+        self, points: dict[JudgedPart, np.ndarray], others: dict[JudgedPart, np.ndarray]
+    ) -> dict[JudgedPart, np.ndarray]:
+        """Weighted RMS distance (T,) of the points of each part."""
+        return {
+            part: np.sqrt(((others[part] - at) ** 2).sum(axis=2) @ self.weights[part])
+            for part, at in points.items()
+        }
+
+    def _arm(self, state: State) -> np.ndarray:
+        """Centre of mass (T, 3) relative to the object's origin, master axes, metres."""
+        return state.rotation @ self._inputs.geometry.mesh.centre_of_mass
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +196,13 @@ class HeldOut:
     """Errors of the result itself, in all cameras."""
     held_out: ViewErrors
     """Errors in the held-out camera of a fit that did not use it."""
-    keypoint_m: np.ndarray
-    """(T,) keypoint error in the held-out camera, converted to metres at the person's distance."""
     shift: dict[JudgedPart, np.ndarray]
     """(V, T) by part, displacement if a camera is left out, metres."""
+    surface: dict[JudgedPart, np.ndarray]
+    """(T,) by part, displacement if no surface point is used, metres."""
+    common: dict[JudgedPart, np.ndarray]
+    """(T,) by part, standard deviation in space due to the cameras' covariance, metres; NaN if the
+    fit does not compare the images of the part."""
     repeated: dict[JudgedPart, np.ndarray]
     """(T,) by part, displacement if the images of this and every other frame are not used,
     metres."""
@@ -131,40 +222,57 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
     cameras = np.flatnonzero(seen)
     if len(cameras) < 2:
         return None
-    refits = Refits(assembly, state)
-    everything = np.ones(within.keypoint_px.shape, bool)
-    without = []
-    for camera in cameras:
+    pulls = _camera_pulls(assembly, state, result.camera_covariance)
+    refits, points = Refits(assembly, state, pulls), JudgedPoints(inputs)
+    everything = np.ones((*within.keypoint_px.shape, 2), bool)
+
+    def without(frames: slice, cameras: slice | int, kind: slice | int) -> State:
         used = everything.copy()
-        used[:, camera] = False
-        without.append(refits.with_views(used))
-    half = []
-    for first in (0, 1):
-        used = everything.copy()
-        used[first::2] = False
-        half.append(refits.with_views(used))
+        used[frames, cameras, kind] = False
+        return refits.with_images(used)
+
+    whole = slice(None)
+    by_camera = [without(whole, int(camera), whole) for camera in cameras]
+    half = [without(slice(first, None, 2), whole, whole) for first in (0, 1)]
+    no_surface = without(whole, whole, SURFACE)
+    common = points.along(state, refits.displaced)
+    if isinstance(assembly.object_, ObjectData):
+        common[JudgedPart.OBJECT] = np.full(len(state), np.nan)
     # For errors in images, the cameras are held out in turn for 0.2 s each: longer than the window
     # of velocities, and short enough that each has a turn in a recording of two seconds.
     block = np.arange(len(state)) // max(1, round(inputs.fps * 0.2))
     turn = block % len(cameras)
-    mixed = _select_states(without, turn)  # each frame from the fit without its held-out camera
+    mixed = _select_states(by_camera, turn)  # each frame from the fit without its held-out camera
     camera_index = cameras[turn]
     judged = _errors_in_held_out(assembly, mixed, camera_index)
-    points = _points(inputs, state)
-    moved = [_points(inputs, other) for other in without]
-    halves = _points(inputs, _select_states(half, np.arange(len(state)) % 2))
+    at = points.at(state)
+    moved = [points.apart(at, points.at(other)) for other in by_camera]
+    halves = _select_states(half, np.arange(len(state)) % 2)
     return HeldOut(
         cameras,
         camera_index,
         within,
         judged,
-        _pixels_to_metres(judged.keypoint_px, result, points[JudgedPart.BODY]),
-        {
-            part: np.stack([_rms(other[part] - at) for other in moved])
-            for part, at in points.items()
-        },
-        {part: _rms(halves[part] - at) for part, at in points.items()},
+        shift={part: np.stack([each[part] for each in moved]) for part in at},
+        surface=points.apart(at, points.at(no_surface)),
+        common=common,
+        repeated=points.apart(at, points.at(halves)),
     )
+
+
+def _camera_pulls(assembly: Assembly, state: State, covariance: np.ndarray) -> np.ndarray:
+    """Gradients (T, 174, k) due to independent corrections of the cameras, one deviation each.
+
+    They are H_xd S^(1/2), with the ``covariance`` S (C, 7, C, 7). 0 for an object without images.
+    """
+    count = covariance.shape[0] * covariance.shape[1]
+    variance, axes = np.linalg.eigh(covariance.reshape(count, count))
+    root = axes * np.sqrt(variance.clip(min=0))
+    pulls = np.zeros((len(state), ALL.stop, count))
+    pulls[:, BODY] = assembly.body.camera_evidence(state, 1.0).cross @ root
+    if isinstance(assembly.object_, ObjectImagesData):
+        pulls[:, OBJECT] = assembly.object_.camera_evidence(state).cross @ root
+    return pulls
 
 
 def _fix_to_result(assembly: Assembly, result: JointResult) -> None:
@@ -206,18 +314,6 @@ def _view_errors(body: BodyData, reports: Iterable[tuple[int, int, ViewReport]])
     return ViewErrors(keypoint, body.person_by_view(), overlap, depth)
 
 
-def _pixels_to_metres(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> np.ndarray:
-    """Errors (T,) in metres at the mean depth of the body's ``joints`` (T, J, 3).
-
-    ``pixels`` (T, C) has one finite value per frame.
-    """
-    rig = result.cameras.rig
-    pose = rig.colour_from_master
-    depth = joints.mean(axis=1) @ pose[:, 2, :3].T + pose[:, 2, 3]
-    size = pixels * depth / rig.colour_parameters[:, 0]
-    return np.where(np.isfinite(size).any(axis=1), np.nansum(size, axis=1), np.nan)
-
-
 def _select_states(states: list[State], which: np.ndarray) -> State:
     """State whose frame t is that of ``states[which[t]]``.
 
@@ -229,20 +325,3 @@ def _select_states(states: list[State], which: np.ndarray) -> State:
         for name in ("body", "rotation", "translation")
     )
     return State(body, first.betas, first.expression, rotation, translation)
-
-
-def _points(inputs: JointInputs, state: State) -> dict[JudgedPart, np.ndarray]:
-    """Points (T, K, 3) by which each part is compared: joints, or the object's centre of mass."""
-    with torch.no_grad():
-        posed = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
-    joints = posed.joints.double().numpy()
-    found = {part: joints[:, at] for part, at in JOINTS.items()}
-    if inputs.geometry.has_object:
-        centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation
-        found[JudgedPart.OBJECT] = centre[:, None]
-    return found
-
-
-def _rms(shift: np.ndarray) -> np.ndarray:
-    """Root mean square length (T,) of (T, K, 3)."""
-    return np.sqrt((shift**2).sum(axis=2).mean(axis=1))

@@ -7,17 +7,16 @@ of body, hands and object (:mod:`.stated`).
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.evaluation.verdict.hold_out import JOINTS, JudgedPart, hold_out
+from intercap_core.evaluation.verdict.hold_out import JudgedPart, JudgedPoints, hold_out
 from intercap_core.evaluation.verdict.stated import FEATURES, estimate_error
-from intercap_core.joint.inputs import JointInputs, open_inputs
+from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.sequential import SequentialFits
-from intercap_core.schemas import BODY_FIT, JOINT, SCENE
+from intercap_core.schemas import SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
@@ -40,12 +39,14 @@ def reach_verdict(
     with open_inputs(paths, models, fit_settings) as inputs:
         held = hold_out(inputs, fit_settings.joint, result)
         sequential = inputs.sequential
-        has_object = inputs.geometry.has_object
-        parts = [part for part in JudgedPart if part != JudgedPart.OBJECT or has_object]
-        moved = _moved(inputs, result, paths.body_fit, paths.joint)
+        weights = JudgedPoints(inputs).weights
+    parts = list(weights)
     estimates = [
         estimate_error(
-            held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
+            held,
+            part,
+            _sigma(sequential, part, weights[part]),
+            _known(sequential, result, part),
         )
         for part in parts
     ]
@@ -59,7 +60,7 @@ def reach_verdict(
     values: Values = {
         "part_names": [str(part) for part in parts],
         "feature_names": list(FEATURES),
-        "features": np.array([[s.features[name] for name in FEATURES] for s in estimates]),
+        "features": np.stack([s.features for s in estimates]),
         "error": np.array([s.error for s in estimates]),
         "error_factor": np.array([s.factor for s in estimates]),
         "error_frame": np.stack([s.by_frame for s in estimates]),
@@ -82,36 +83,17 @@ def reach_verdict(
     return values
 
 
-def _sigma(fits: SequentialFits, part: JudgedPart) -> np.ndarray:
-    """Standard deviation (T,) of a part that the sequential fits state, metres."""
+def _sigma(fits: SequentialFits, part: JudgedPart, weights: np.ndarray) -> np.ndarray:
+    """Standard deviation in space (T,) of a part that the sequential fits state, metres."""
     if part == JudgedPart.OBJECT:
-        return fits.object_sigma
-    return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
-
-
-def _moved(
-    inputs: JointInputs, result: JointResult, body_fit: Path, joint: Path
-) -> dict[JudgedPart, np.ndarray]:
-    """Displacement (T,) of each part from the sequential fits to the joint fit, metres.
-
-    RMS over the joints of a part; at the centre of mass of the object.
-    """
-    with artefacts.read(body_fit, BODY_FIT) as before, artefacts.read(joint, JOINT) as after:
-        apart = ((after["joints"] - before["joints"]).astype(float) ** 2).sum(axis=2)
-    found = {part: np.sqrt(apart[:, at].mean(axis=1)) for part, at in JOINTS.items()}
-    if inputs.geometry.has_object:
-        middle = inputs.geometry.mesh.centre_of_mass
-        old, new = inputs.sequential.state, result.state
-        turned = (new.rotation - old.rotation) @ middle
-        shift = turned + new.translation - old.translation
-        found[JudgedPart.OBJECT] = np.linalg.norm(shift, axis=1)
-    return found
+        return np.sqrt(3) * fits.object_sigma
+    return np.sqrt(3 * fits.joint_sigma**2 @ weights)
 
 
 def _known(fits: SequentialFits, result: JointResult, part: JudgedPart) -> np.ndarray:
-    """Mask (T,) of the frames in which the part was measured, not filled in, and the images do not
-    contradict the joint fit."""
+    """Mask (T,) of the frames in which the part was measured, not filled in, and neither images nor
+    the other part contradict the joint fit."""
     flags = fits.flags
     if part == JudgedPart.OBJECT:
-        return ~(flags.lost | flags.carried) & ~result.contradicted
-    return ~flags.filled
+        return ~(flags.lost | flags.carried | result.contradicted | result.penetrating)
+    return ~(flags.filled | result.penetrating)

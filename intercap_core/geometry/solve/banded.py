@@ -63,12 +63,14 @@ class BandedFactor:
     """(w+1, T, n, n), laid out as `BandedSystem.bands`."""
 
     def solve(self, right: Tensor) -> Tensor:
-        """Return the solution x (T, n) for the right-hand side (T, n)."""
+        """Return the solutions x (T, n) or (T, n, k) for one or k right-hand sides."""
+        if right.ndim == 2:
+            return self.solve(right[..., None])[..., 0]
         lower = self.lower
         w1, count = lower.shape[:2]
-        x = right[..., None].clone()
         if w1 == 1:
-            return torch.cholesky_solve(x, lower[0])[..., 0]
+            return torch.cholesky_solve(right, lower[0])
+        x = right.clone()
         for t in range(count):
             for k in range(1, min(w1 - 1, t) + 1):
                 x[t] -= lower[k, t - k] @ x[t - k]
@@ -77,4 +79,4 @@ class BandedFactor:
             for k in range(1, min(w1 - 1, count - 1 - t) + 1):
                 x[t] -= lower[k, t].T @ x[t + k]
             x[t] = torch.linalg.solve_triangular(lower[0, t].T, x[t], upper=True)
-        return x[..., 0]
+        return x

@@ -128,18 +128,18 @@ class BodyData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_B's matrix (T, 168, 168), gradient (T, 168), energy (T,) at ``state`` by some views.
+        """E_B's matrix (T, 168, 168), gradient (T, 168), energy (T,) at ``state`` by some images.
 
-        Only views in the mask ``used`` (T, C) count. Correspondences are those of the last
-        :meth:`refresh`.
+        Only keypoints and depth images in the mask ``used`` (T, C, 2) count. Correspondences are
+        those of the last :meth:`refresh`.
         """
         problem, evidence = self._problem, self._fitter.evidence
-        counted = torch.as_tensor(used[self._fitter.frames])[..., None]
+        keypoints, depth = torch.as_tensor(used[self._fitter.frames])[..., None, :].unbind(-1)
         views, rows = problem.views, problem.rows
         assert views is not None, "refresh comes first"
-        problem.views = replace(views, confidence=views.confidence * counted)
+        problem.views = replace(views, confidence=views.confidence * keypoints)
         if evidence.by_view is not None:
-            problem.rows = evidence.rows(evidence.by_view.points * counted)
+            problem.rows = evidence.rows(evidence.by_view.points * depth)
         try:
             return self._equations(state)
         finally:

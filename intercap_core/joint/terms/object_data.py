@@ -47,13 +47,13 @@ class ObjectData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some views.
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some images.
 
-        The track states no information of single views. All views that show the object have equal
-        shares of it, and those in the mask ``used`` (T, C) count.
+        The track states no information of single images. All views that show the object have equal
+        shares of it, as have both images of a view. Those in the mask ``used`` (T, C, 2) count.
         """
         seen = self._poses.share.sum(axis=1) > 0
-        kept = np.where(seen, (self._poses.share * used).sum(axis=1), 1.0)
+        kept = np.where(seen, (self._poses.share * used.mean(axis=2)).sum(axis=1), 1.0)
         return self._equations(kept[:, None, None] * self._poses.information, state)
 
     def _equations(

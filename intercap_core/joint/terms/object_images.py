@@ -223,16 +223,18 @@ class ObjectImagesData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some views.
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some images.
 
-        Only views in the mask ``used`` (T, C) count, as compared in the last :meth:`refresh`.
+        Only silhouettes and depth images in the mask ``used`` (T, C, 2) count, as compared in the
+        last :meth:`refresh`.
         """
         matrix, gradient = self._matrix.copy(), self._gradient.copy()
         for t, evidence in self._agreeing.items():
-            views = used[t, list(self._cameras)]
-            form = self._form(
-                t, evidence.information[views].sum(0), evidence.gradient[views].sum(0)
-            )
+            contour, depth = used[t, list(self._cameras)].T.astype(float)
+            information = np.einsum("v,vij->ij", contour, evidence.information)
+            information += np.einsum("v,vij->ij", depth - contour, evidence.of_depth)
+            slope = contour @ evidence.gradient + (depth - contour) @ evidence.depth_gradient
+            form = self._form(t, information, slope)
             matrix[t], gradient[t] = form.matrix, form.slope
         return _equations(matrix, gradient, self._offset(state))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,18 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
+from intercap_core.evaluation.verdict.hold_out import (
+    HeldOut,
+    JudgedPart,
+    JudgedPoints,
+    hold_out,
+)
 from intercap_core.evaluation.verdict.judge import reach_verdict
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import assemble
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.minimise import limited
-from intercap_core.joint.result import JointResult
+from intercap_core.joint.result import OBJECT_INSIDE, JointResult
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.schemas import SCENE
 from tests.helpers import fitted_capture as fitted
@@ -113,19 +119,57 @@ def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: H
                 state = state.moved(limited(step))
             return state
 
-        used = np.ones((6, 3), bool)
+        used = np.ones((6, 3, 2), bool)
         every = descended(used)
         used[:, 1] = False
         without = descended(used)
-        joints = [_joints(inputs, state) for state in (every, without)]
-    moved = np.sqrt(((joints[1] - joints[0]) ** 2).sum(axis=2).mean())
+        points = JudgedPoints(inputs)
+        apart = points.apart(points.at(every), points.at(without))[JudgedPart.BODY]
+    moved = np.sqrt((apart**2).mean())
     found = np.sqrt((held.shift[JudgedPart.BODY][1] ** 2).mean())
     assert found == pytest.approx(moved, rel=0.35, abs=2e-4)
 
 
-def _joints(inputs: JointInputs, state: State) -> np.ndarray:
-    body = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
-    return body.joints.detach().numpy()[:, JOINTS[JudgedPart.BODY]]
+def test_common_error_is_the_displacement_that_moved_cameras_cause(
+    capture: fitted.Capture,
+) -> None:
+    """The response of the fit to a shift of all cameras, against Gauss-Newton steps."""
+    with _opened(capture) as (inputs, settings, result):
+        assembly = assemble(inputs, settings)
+        assembly.contact.take_contact(result.probability, result.annotated)
+        shift = np.zeros((len(result.camera_covariance), 7))
+        shift[:, 3] = 0.002  # 2 mm along the master's x axis
+        covariance = np.multiply.outer(shift, shift)
+        held = hold_out(inputs, settings, replace(result, camera_covariance=covariance))
+        assert held is not None
+        # all data move by 2 mm, and no term holds the body back
+        np.testing.assert_allclose(held.common[JudgedPart.BODY], 0.002, rtol=0.1)
+        np.testing.assert_allclose(held.common[JudgedPart.HANDS], 0.002, rtol=0.1)
+        np.testing.assert_allclose(held.common[JudgedPart.OBJECT][1:], 0.002, rtol=0.1)
+
+
+def test_displacements_along_steps_agree_with_finite_differences(capture: fitted.Capture) -> None:
+    with _opened(capture) as (inputs, _, result):
+        points, state = JudgedPoints(inputs), result.state
+        step = np.random.default_rng(3).normal(0, 1e-5, (len(state), 174))
+        along = points.along(state, step[..., None])
+        apart = points.apart(points.at(state), points.at(state.moved(step)))
+    for part, value in along.items():
+        np.testing.assert_allclose(value, apart[part], rtol=0.02, err_msg=str(part))
+
+
+def test_without_surface_points_only_keypoints_hold_the_body(
+    capture: fitted.Capture, held: HeldOut, tmp_path: Path
+) -> None:
+    """Keypoints that all views displace alike do not show in any held-out camera."""
+    lying = capture.copied(tmp_path, "person")
+    with lying.edit("person") as file:
+        file["keypoints"][..., 1] += 4.0  # px, downwards in all views
+    lie = _held(lying)
+    more = lie.surface[JudgedPart.BODY].mean() - held.surface[JudgedPart.BODY].mean()
+    cameras = [h.shift[JudgedPart.BODY].mean() for h in (held, lie)]
+    assert more > 0.2 * 4.0 * 2.4 / 230  # of what the lie is worth at the person's distance
+    assert more > 2 * abs(cameras[1] - cameras[0])
 
 
 def test_single_camera_has_no_verdict(capture: fitted.Capture, tmp_path: Path) -> None:
@@ -137,3 +181,16 @@ def test_single_camera_has_no_verdict(capture: fitted.Capture, tmp_path: Path) -
     assert np.isnan(values["error"]).all()
     assert all("fewer than two cameras" in reason for reason in values["silent"])
     assert "shift" not in values
+
+
+def test_no_error_is_stated_if_body_and_object_are_inside_each_other(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    wrong = capture.copied(tmp_path, "joint")
+    with wrong.edit("joint") as file:
+        del file["flag_reason"]
+        file["flag_reason"] = np.array([OBJECT_INSIDE.encode()] * 4 + [b""] * 2)
+    values = reach_verdict(wrong.inputs(*STAGES, "joint"), capture.models, fitted.FIT_SETTINGS)
+    assert list(values["part_names"]) == ["body", "hands", "object"]
+    assert np.isnan(values["error"]).all()
+    assert all("not contradicted" in reason for reason in values["silent"])

@@ -12,42 +12,47 @@ from bench import verdict as bench
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors, verdict_figures
 from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart, ViewErrors
-from intercap_core.evaluation.verdict.stated import FACTORS, estimate_error
+from intercap_core.evaluation.verdict.stated import CALIBRATION, estimate_error
 
 T = 4
 
 
-def _held(shift: float, keypoint: float) -> HeldOut:
+def _held(shift: float, surface: float = 0.02, common: float = 0.005) -> HeldOut:
     none = np.full((T, 3), np.nan)
     empty = ViewErrors(none, none, none, none)
-    every = {part: np.full((3, T), shift) for part in JudgedPart}
-    still = {part: np.zeros(T) for part in JudgedPart}
-    return HeldOut(np.arange(3), np.zeros(T, int), empty, empty, np.full(T, keypoint), every, still)
+
+    def every(*values: float) -> dict[JudgedPart, np.ndarray]:
+        return {part: np.tile(np.array(values)[:, None], (1, T)).squeeze() for part in JudgedPart}
+
+    return HeldOut(
+        np.arange(3), np.zeros(T, int), empty, empty,
+        every(shift, shift, shift), every(surface), every(common), every(0.0),
+    )  # fmt: skip
 
 
-def test_features_add_up_as_squares() -> None:
-    said = estimate_error(
-        _held(0.003, 0.02), JudgedPart.BODY, np.full(T, 0.005), np.full(T, 0.004), np.ones(T, bool)
-    )
-    rest, (shift, keypoint, sigma, moved), spread = FACTORS[JudgedPart.BODY]
-    jackknife = np.sqrt(2 / 3 * 3 * 0.003**2)
-    expected = np.sqrt(
-        rest**2
-        + (shift * jackknife) ** 2
-        + (keypoint * 0.02) ** 2
-        + (sigma * 0.005) ** 2
-        + (moved * 0.004) ** 2
-    )
+JACKKNIFE = np.sqrt(2 / 3 * 3 * 0.003**2)  # of three cameras that each move a part by 3 mm
+
+
+@pytest.mark.parametrize(
+    ("part", "features"),
+    [
+        (JudgedPart.BODY, (JACKKNIFE, 0.02, 0.005, 0.004)),
+        (JudgedPart.HANDS, (JACKKNIFE, 0.02, 0.005, 0.004)),
+        (JudgedPart.OBJECT, (JACKKNIFE, 0.005)),  # without surface points and sigma
+    ],
+)
+def test_features_add_up_as_squares(part: JudgedPart, features: tuple[float, ...]) -> None:
+    said = estimate_error(_held(0.003), part, np.full(T, 0.004), np.ones(T, bool))
+    expected = CALIBRATION[part].scale * np.linalg.norm(features)
+    assert said.features == pytest.approx([JACKKNIFE, 0.02, 0.005, 0.004])
     assert said.error == pytest.approx(expected)
     assert said.by_frame == pytest.approx(np.full(T, expected))
-    assert said.factor == spread and said.silent == ""
+    assert said.factor == CALIBRATION[part].spread and said.silent == ""
 
 
 def test_filled_frames_have_no_stated_error() -> None:
     known = np.array([True, True, True, False])
-    said = estimate_error(
-        _held(0.003, 0.02), JudgedPart.OBJECT, np.full(T, 0.005), np.zeros(T), known
-    )
+    said = estimate_error(_held(0.003), JudgedPart.OBJECT, np.full(T, 0.005), known)
     assert np.isfinite(said.error)
     np.testing.assert_array_equal(np.isfinite(said.by_frame), known)
 
@@ -56,15 +61,13 @@ def test_filled_frames_have_no_stated_error() -> None:
     ("held", "known", "reason"),
     [
         (None, T, "fewer than two cameras"),
-        (_held(0.003, 0.02), 1, "only 1 of 4 frames"),
-        (_held(np.nan, 0.02), T, "only 0 of 4 frames"),
-        (_held(0.003, np.nan), T, "only 0 of 4 frames"),
+        (_held(0.003), 1, "only 1 of 4 frames"),
+        (_held(np.nan), T, "only 0 of 4 frames"),
+        (_held(0.003, common=np.nan), T, "does not compare its images"),
     ],
 )
 def test_no_stated_error_without_evidence(held: HeldOut | None, known: int, reason: str) -> None:
-    said = estimate_error(
-        held, JudgedPart.BODY, np.full(T, 0.005), np.zeros(T), np.arange(T) < known
-    )
+    said = estimate_error(held, JudgedPart.OBJECT, np.full(T, 0.005), np.arange(T) < known)
     assert np.isnan(said.error) and np.isnan(said.by_frame).all()
     assert reason in said.silent
 
@@ -94,6 +97,8 @@ def test_figures_of_stated_errors() -> None:
     assert found["within_factor_share"] == pytest.approx(2 / 3)
     assert found["bad_sequence_recall"] == pytest.approx(1 / 2)
     assert found["silent_share"] == pytest.approx(1 / 4)
+    assert found["coverage_body"] == pytest.approx(2 / 3)  # 24 is outside 8 to 18
+    assert found["range_factor_body"] == pytest.approx(1.5)
 
 
 def test_the_true_error_is_that_of_frames_with_a_stated_one() -> None:
@@ -121,19 +126,23 @@ def test_no_figures_without_verdict_or_truth() -> None:
     assert not stated_errors(bare) and verdict_figures([bare]) == {}
 
 
-def test_factors_are_found_again() -> None:
+def test_calibration_is_found_again() -> None:
     rng = np.random.default_rng(7)
-    features = rng.uniform(0.001, 0.02, (400, 3))
-    true = np.sqrt(0.004**2 + (features**2 * np.array([2.0, 0.6, 0.0]) ** 2).sum(axis=1))
-    noisy = true * np.exp(rng.normal(0, 0.1, len(true)))
-    kind = np.array(["a", "b"])[np.arange(len(true)) % 2]
-    samples = bench.Samples(features, noisy, kind)
-    factors = bench.fit(samples)
-    assert factors.rest == pytest.approx(0.004, rel=0.2)
-    assert factors.of == pytest.approx((2.0, 0.6, 0.0), abs=0.15)
+    size = rng.uniform(0.001, 0.02, 400)
+    true = 0.7 * size * np.exp(rng.normal(0, 0.1, len(size)))
+    found, stated = bench.calibrate(bench.Samples(size, true, np.repeat(["a", "b"], 200)))
+    assert found.scale == pytest.approx(0.7, rel=0.03)
     # four of five of a normal deviate are within 1.28 deviations
-    assert factors.spread == pytest.approx(np.exp(1.28 * 0.1), rel=0.03)
-    assert np.median(np.abs(np.log(bench.cross_validated(samples) / true))) < 0.03
+    assert found.spread == pytest.approx(np.exp(1.28 * 0.1), rel=0.03)
+    assert np.median(np.abs(np.log(stated / true))) < 0.08
+
+
+def test_spread_holds_for_a_kind_that_the_scale_has_not_seen() -> None:
+    size, kind = np.ones(50), np.repeat(["a", "b"], [40, 10])
+    true = np.where(kind == "a", 1.0, 2.0)  # errors of kind b are twice as large
+    found, stated = bench.calibrate(bench.Samples(size, true, kind))
+    assert found.scale == pytest.approx(1) and found.spread == pytest.approx(2)
+    np.testing.assert_allclose(stated, np.where(kind == "a", 2.0, 1.0))
 
 
 def test_file_without_verdict_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
