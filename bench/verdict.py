@@ -12,7 +12,6 @@ each kind is predicted by a scale fitted to the other kinds.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import spearmanr
+from scipy.stats import binom, spearmanr
 
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -30,7 +29,7 @@ from intercap_core.evaluation.verdict.hold_out import JudgedPart
 from intercap_core.evaluation.verdict.stated import Calibration, size
 
 SPREAD_SHARE = 0.8  # of the true errors that are within a part's spread
-COMMON_KIND = 10  # recordings from which on a kind has to be within the spread on its own
+COMMON_KIND = 10  # recordings from which on a kind counts on its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,25 +76,45 @@ def read(paths: Sequence[Path], alike: Sequence[Sequence[str]] = ()) -> dict[Jud
 def calibrate(samples: Samples) -> tuple[Calibration, np.ndarray]:
     """Scale and spread of a part, and its cross-validated stated errors (N,), metres.
 
-    The scale is the median ratio of true errors and features. Four of five cross-validated errors
-    are within the spread, among all recordings and in each kind of at least ``COMMON_KIND``. Of n
-    errors it is the ceil(0.8 (n + 1))-th, so that it covers a further one with a probability of
-    80 % (conformal prediction, Vovk et al. 2005).
+    Four of five errors of further recordings are within the spread with a confidence of 80 %, for
+    all recordings and for each kind of at least ``COMMON_KIND``: a tolerance limit of the
+    cross-validated errors (Wilks 1941).
     """
     ratio, kinds = samples.true / samples.size, np.unique(samples.kind)
     stated = np.empty(len(ratio))
     for kind in kinds:
         own = samples.kind == kind
         others = ~own if len(kinds) > 1 else own
-        stated[own] = np.median(ratio[others]) * samples.size[own]
+        stated[own] = _scale(ratio[others], samples.kind[others]) * samples.size[own]
     off = np.abs(np.log(samples.true / stated))
-    groups = [np.ones(len(off), bool), *(samples.kind == kind for kind in kinds)]
-    spread = max(
-        np.sort(off[rows])[min(math.ceil(SPREAD_SHARE * (rows.sum() + 1)), rows.sum()) - 1]
-        for place, rows in enumerate(groups)
-        if place == 0 or rows.sum() >= COMMON_KIND
-    )
-    return Calibration(float(np.median(ratio)), float(np.exp(spread))), stated
+    groups = [np.ones(len(off), bool), *_common(samples.kind)]
+    spread = max(_tolerance_limit(off[rows]) for rows in groups)
+    return Calibration(_scale(ratio, samples.kind), float(np.exp(spread))), stated
+
+
+def _scale(ratio: np.ndarray, kind: np.ndarray) -> float:
+    """Geometric mean of the median ratios of all common kinds; of all recordings if none is.
+
+    So a real detector counts as much as simulated keypoints, of which there are more recordings.
+    """
+    groups = _common(kind) or [np.ones(len(kind), bool)]
+    return float(np.exp(np.mean([np.log(np.median(ratio[rows])) for rows in groups])))
+
+
+def _tolerance_limit(values: np.ndarray) -> float:
+    """Limit that exceeds ``SPREAD_SHARE`` of the population with a confidence of the same size.
+
+    The k-th smallest of n values does so with the probability that fewer than k of n are below the
+    quantile. The limit is interpolated between two values; it is the largest if n is too small.
+    """
+    confidence = binom.cdf(np.arange(len(values)), len(values), SPREAD_SHARE)
+    return float(np.interp(SPREAD_SHARE, confidence, np.sort(values)))
+
+
+def _common(kind: np.ndarray) -> list[np.ndarray]:
+    """Masks (N,) of the recordings of each kind of at least ``COMMON_KIND``."""
+    rows = [kind == name for name in np.unique(kind)]
+    return [mask for mask in rows if mask.sum() >= COMMON_KIND]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
