@@ -16,6 +16,7 @@ from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.evaluation.body import FOOT_JOINTS
+from intercap_core.evaluation.faulty_rigs import NamedFault
 from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.scene_errors import (
     CUBE_SIDE_M,
@@ -60,6 +61,8 @@ class FieldScene:
     """Mean height error of the floor under the true feet; NaN without a floor."""
     tilt_deg: float
     """Angle between estimated and true floor normal; NaN without a floor."""
+    faults: tuple[NamedFault, ...] = ()
+    """Cameras that were named in faulty variants of the recording."""
 
     @property
     def worse(self) -> np.ndarray:
@@ -205,6 +208,19 @@ def in_step_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
         return {}
     moved = np.concatenate([np.abs(s.late_s) >= 0.5 / s.fps for s in scenes])
     return {"in_step_moved_share": float(moved.mean())}
+
+
+def fault_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+    """Mean share of the cameras at fault that were named, in variants with moved or exchanged
+    cameras or another calibration; and the number of correct cameras that were named."""
+    faults = [fault for scene in scenes for fault in scene.faults]
+    if not faults:
+        return {}
+    shares = [fault.named for fault in faults if np.isfinite(fault.named)]
+    return {
+        "moved_camera_named_share": float(np.mean(shares)),
+        "moved_camera_false_alarms": float(sum(fault.false for fault in faults)),
+    }
 
 
 def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:

@@ -22,6 +22,10 @@ from intercap_core.person.subject_joints import fill_middles, triangulate_people
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
 from intercap_core.scene.slips import longest_slip
 
+# Error of an inlier, pixels of a 1080p image; it allows for errors of the given poses, about a
+# centimetre. Tuned on the studio.
+MAX_ERROR_PX = 40.0
+
 
 def add_late_views(
     index: np.ndarray, detections: PeopleOfImages, joints: np.ndarray, rig: Rig, times: np.ndarray
@@ -102,8 +106,9 @@ def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
     sets, views = keypoints.shape[:2]
     body = np.zeros_like(keypoints)
     body[:, :, BODY_POINTS] = keypoints[:, :, BODY_POINTS]
-    # the limit allows for errors of the given poses, about a centimetre; tuned on the studio
-    body, points = triangulate_people(body, rig, min_confidence=MIN_CONFIDENCE, max_error_px=40.0)
+    body, points = triangulate_people(
+        body, rig, min_confidence=MIN_CONFIDENCE, max_error_px=MAX_ERROR_PX
+    )
     keypoints = keypoints.copy()
     keypoints[:, :, BODY_POINTS] = body[:, :, BODY_POINTS]
     inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)

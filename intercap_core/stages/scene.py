@@ -16,6 +16,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, camera_background
+from intercap_core.scene.camera_agreement import find_disagreements, widened
 from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
 from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.extrinsics import Refinement, refine
@@ -143,11 +144,17 @@ def run(
             floor=FloorConstraint.of(rig, surfaces, given_ground),
             free_poses=settings.refine_extrinsics,
         )
+        disagreements = find_disagreements(people, subject, image_of, rig)
         rig = rig.moved(refined.poses)
+        if disagreements:
+            left = find_disagreements(people, subject, image_of, rig)
+            refined = replace(refined, covariance=widened(refined.covariance, rig, left))
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
         ground, up, more_notes = _with_feet(source, rig, ground, subject, floor)
         slides, known_to = _slides(rig, refined, up.direction)
         notes = _notes(source, refined, moments, stated, exchanges)
+        for one in disagreements:
+            notes[one.camera].append(str(one))
         for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
             note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []

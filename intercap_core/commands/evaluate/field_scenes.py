@@ -7,6 +7,7 @@ mostly floor, a person on a balance beam.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from rich.table import Table
@@ -22,6 +23,7 @@ from intercap_core.commands.evaluate.part import (
     truth_of,
 )
 from intercap_core.evaluation import field_errors
+from intercap_core.evaluation.faulty_rigs import name_faults
 from intercap_core.evaluation.field_errors import FieldScene
 from intercap_core.project import Project
 
@@ -31,9 +33,12 @@ STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "fiel
 
 
 def measure(project: Project, sequence: str) -> FieldScene:
-    """Errors of one recording after ``scene``."""
+    """Errors of one recording after ``scene``; of ``floor`` also faulty variants."""
     paths = project.paths(sequence)
-    return field_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
+    scene = field_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
+    if not str(project.config.dataset).startswith(FLOOR):
+        return scene
+    return replace(scene, faults=tuple(name_faults(paths.frames, paths.detections)))
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
@@ -44,6 +49,7 @@ def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     found |= keyed("field.", field_errors.beam_figures(_of(evaluations, BEAM)))
     together = _of(evaluations, FLOOR) + _of(evaluations, BEAM)
     found |= keyed("field.", field_errors.in_step_figures(together))
+    found |= keyed("field.", field_errors.fault_figures(_of(evaluations, FLOOR)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
             rate = measured.dataset.removeprefix(STARTS)
