@@ -32,6 +32,7 @@ from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
 from intercap_core.scene.subject_views import MAX_ERROR_PX, SubjectViews
 
 NOT_AGREEING = "does not agree with the other cameras"  # begins the note of a named camera
+UNDETERMINED = "cause not determined"
 AGREES = 0.8  # share of inliers of a hypothesis that holds; correct cameras of the studio: 0.9
 CONTRADICTS = 0.5  # share of inliers below which a camera is named: most detections are outliers
 
@@ -106,7 +107,7 @@ def find_disagreements(
     if not bad:
         return []
     agreeing = [c for c in range(len(rig)) if share[c] >= CONTRADICTS and c not in bad]
-    causes = dict.fromkeys(bad, "cause not determined")
+    causes = dict.fromkeys(bad, UNDETERMINED)
     exchanged = _exchanged(views, rig, bad)
     if exchanged is not None:
         bad = list(exchanged)
@@ -119,7 +120,7 @@ def find_disagreements(
         # no majority tells which cameras are wrong
         bad = [c for c in range(len(rig)) if np.isfinite(by_set[:, c]).any()]
         words = "too few cameras agree to tell which: the calibration may be of another session"
-        causes = dict.fromkeys(bad, words if len(rig) > 2 else "cause not determined")
+        causes = dict.fromkeys(bad, words if len(rig) > 2 else UNDETERMINED)
     else:
         for c in bad:
             part = moved_at[c]
@@ -140,14 +141,17 @@ def find_disagreements(
 
 def widened(covariance: np.ndarray, rig: Rig, found: list[Disagreement]) -> np.ndarray:
     """Covariance (C, 7, C, 7) in which the pose of each camera of ``found`` has at least the
-    deviation of its error; a fixed pose stays fixed."""
+    deviation of its error; a fixed pose stays fixed.
+
+    If the cause is not determined, the keypoints may be those at fault, and the deviation is kept.
+    """
     result = covariance.copy()
     for one in found:
         c = one.camera
         arm = ring_centre(rig) - rig.master_from_colour[c, :3, 3]
         by_pose = np.concatenate([np.cross(np.eye(3), arm).T, np.eye(3)], axis=1)
         sigma = float(np.sqrt(np.trace(by_pose @ result[c, :6, c, :6] @ by_pose.T)))
-        if sigma > 0:
+        if sigma > 0 and one.cause != UNDETERMINED:
             factor = max(1.0, one.error_m / sigma)
             result[c, :6] *= factor
             result[:, :, c, :6] *= factor
