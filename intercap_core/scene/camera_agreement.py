@@ -135,7 +135,9 @@ def find_disagreements(
     return [
         Disagreement(c, causes[c], float(error[c]), usual, _metres(rig, c, error[c]))
         for c in bad
-        if error[c] > MAX_ERROR_PX  # half of its detections are outliers against the others
+        # A part of the recording may show someone else: a cause must explain it.
+        if (share[c] < CONTRADICTS or causes[c] != UNDETERMINED)
+        and error[c] > MAX_ERROR_PX  # half of its detections are outliers against the others
     ]
 
 
@@ -239,6 +241,8 @@ def _displacement(views: _Views, rig: Rig, camera: int, part: slice | None) -> s
     away = poses[camera, :3, :3].T @ pose[:3, :3]
     degrees = np.degrees(Rotation.from_matrix(away).magnitude())
     metres = float(np.linalg.norm(pose[:3, 3] - poses[camera, :3, 3]))
+    if metres > float(np.linalg.norm(ring_centre(rig) - poses[camera, :3, 3])):
+        return ""  # beyond the person: these are the keypoints of someone else
     poses[camera] = pose
     check = _Views(keypoints[1::2])
     if _mean(check.shares(rig.moved(poses)))[camera] < AGREES:
