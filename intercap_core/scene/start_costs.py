@@ -2,7 +2,8 @@
 
 People are followed in each camera's images separately, so the cameras need not be synchronised.
 A detector may exchange left and right. Only body points are used that do not depend on the sides:
-nose, neck, middle of the hips, middle between both knees, and others.
+nose, neck, middle of the hips, middle between both knees, and others. The search uses the points of
+:data:`SEARCHED`; those of :data:`WITNESS` check its result.
 
 Axes: T sets, C cameras, P places for people, K body points.
 """
@@ -25,24 +26,39 @@ from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
-_LEFT, _RIGHT = (
-    [
-        KEYPOINT_INDEX[f"{side}_{name}"]
-        for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-    ]
-    for side in ("left", "right")
-)
-_ALONE = [KEYPOINT_INDEX[name] for name in ("nose", "neck", "mid_hip")]
+_ALONE = ("nose", "neck", "mid_hip")
+_SIDED = (
+    "shoulder", "elbow", "wrist", "hip", "knee", "ankle",
+    "eye", "ear", "big_toe", "heel", "middle1",
+)  # fmt: skip
+_SINGLE = [KEYPOINT_INDEX[name] for name in _ALONE]
+_LEFT, _RIGHT = ([KEYPOINT_INDEX[f"{s}_{name}"] for name in _SIDED] for s in ("left", "right"))
+_PLACES = {name: k for k, name in enumerate(_ALONE + _SIDED)}
+
+# Places in :func:`body_middles` of the points that the search uses, by group. The points of a group
+# share errors of the detector, because they are neighbours or derived from each other.
+SEARCHED = {
+    group: tuple(_PLACES[name] for name in names)
+    for group, names in {
+        "head and shoulders": ("nose", "neck", "shoulder"),
+        "arms": ("elbow", "wrist"),
+        "hips": ("mid_hip", "hip"),
+        "legs": ("knee", "ankle"),
+    }.items()
+}
+# Places of the points of face, feet and hands, which the search does not use.
+WITNESS = tuple(_PLACES[name] for name in ("eye", "ear", "big_toe", "heel", "middle1"))
 
 
 def body_middles(person: np.ndarray) -> np.ndarray:
     """Pixels (K, 2) of the body points of a person (135, 3) that do not depend on left and right.
 
     They are nose, neck and mid hip, and the middles of left and right shoulder, elbow, wrist, hip,
-    knee and ankle. NaN if a point or one of both sides is not seen.
+    knee, ankle, eye, ear, big toe, heel and knuckle of the middle finger. NaN if a point or one of
+    both sides is not seen.
     """
     known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
-    return np.concatenate([known[_ALONE], (known[_LEFT] + known[_RIGHT]) / 2])
+    return np.concatenate([known[_SINGLE], (known[_LEFT] + known[_RIGHT]) / 2])
 
 
 def follow_rays(
@@ -58,7 +74,7 @@ def follow_rays(
         times: (T,) seconds of the sets.
         available: (T, C) bool, the set has an image of the camera.
     """
-    rays = np.full((*available.shape, 3, len(_ALONE) + len(_LEFT), 2), np.nan)
+    rays = np.full((*available.shape, 3, len(_PLACES), 2), np.nan)
     for c, usual in enumerate(usual_steps(available)):
         images = np.flatnonzero(available[:, c])
         for t in images.tolist():
@@ -127,19 +143,17 @@ def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class PairCosts:
-    """Disagreement of pairs of cameras, by lag and set.
+    """Mean disagreement of pairs of cameras, by lag and body point.
 
     A delay of camera c by d sets means that it shows moment t in its image of set t + d. The lag of
     a pair (a, b) is the delay of b minus that of a.
     """
 
-    cost: dict[tuple[int, int], np.ndarray]
-    """Costs (4 reach + 1, T), 0 to 1, by cameras (a, b) with a < b. Row lag + 2 reach, column t
-    compares a's image of set t with b's image of set t + lag; NaN = unknown."""
-    views: int
-    """Number of cameras."""
+    cost: np.ndarray
+    """(C, C, 2 reach + 1, K) mean cost of a pair (a, b), 0 to 1, at lag index - reach; NaN =
+    unknown."""
     reach: int
-    """Largest delay of a camera that is tried, sets."""
+    """Largest delay of a camera, and largest lag of a pair, that is tried, sets."""
 
     @classmethod
     def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> PairCosts:
@@ -148,50 +162,42 @@ class PairCosts:
         ``fewest``: least number of sets in which two people must be seen together at a lag; costs
         of others are NaN.
         """
-        lags = range(-2 * reach, 2 * reach + 1)
+        lags, views = range(-reach, reach + 1), len(rig)
         occupied = np.isfinite(rays[..., 0]).any((0, 3))  # (C, P)
         people = [rays[:, c, places] for c, places in enumerate(occupied)]
-        cost = {}
-        for a, b in combinations(range(len(rig)), 2):
+        cost = np.full((views, views, len(lags), rays.shape[3]), np.nan)
+        for a, b in combinations(range(views), 2):
             epipolar = _epipolar_geometry(rig, a, b)
-            cost[a, b] = np.stack(
-                [_cost(people[a], people[b], epipolar, lag, fewest) for lag in lags]
-            )
-        return cls(cost, len(rig), reach)
-
-    def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
-        """Mean cost (T + 2 reach,) of a camera's pairs with ``others``, by moment.
-
-        Moment t is at index t + reach.
-
-        Args:
-            late: tried delay of the camera, sets.
-            sets: (C,) delays of all cameras, used for the others.
-        """
-        rows = []
-        for other in others:
-            a, b = sorted((camera, other))
-            own, theirs = (late, int(sets[other]))
-            lag = own - theirs if a == other else theirs - own
-            row = self.cost[a, b][lag + 2 * self.reach]
-            series = np.full(len(row) + 2 * self.reach, np.nan)
-            start = self.reach - (theirs if a == other else own)  # a's set t shows moment t - late
-            series[start : start + len(row)] = row
-            rows.append(series)
-        return known_mean(np.array(rows))
+            for i, lag in enumerate(lags):
+                cost[a, b, i] = _cost(people[a], people[b], epipolar, lag, fewest)
+            cost[b, a] = cost[a, b, ::-1]
+        return cls(cost, reach)
 
     def profile(
-        self, camera: int, others: Sequence[int], sets: np.ndarray, bound: int | None = None
+        self,
+        camera: int,
+        others: Sequence[int],
+        late: np.ndarray,
+        points: Sequence[int],
+        bound: int | None = None,
     ) -> np.ndarray:
-        """Mean cost (2 reach + 1,) of a camera by its delay, -reach to reach.
+        """Mean cost (2 reach + 1,) of a camera's pairs by its delay, -reach to reach.
 
-        NaN if unknown, or if the delay exceeds ``bound`` sets.
+        Args:
+            others: the other cameras of the pairs.
+            late: (C,) delays of all cameras, sets.
+            points: compared body points.
+            bound: largest delay, sets; None = ``reach``.
+
+        Returns:
+            Cost; NaN if unknown, or beyond ``bound``.
         """
-        tried = range(-self.reach, self.reach + 1)
-        cost = known_mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
-        if bound is not None:
-            cost[np.abs(np.array(tried)) > bound] = np.nan
-        return cost
+        tried = np.arange(-self.reach, self.reach + 1)
+        lag = tried[:, None] - late[list(others)]
+        cost = self.cost[list(others), camera, np.clip(lag + self.reach, 0, 2 * self.reach)]
+        cost = np.where(np.abs(lag)[..., None] <= self.reach, cost, np.nan)[..., list(points)]
+        cost = known_mean(cost.reshape(len(tried), -1).T)
+        return cost if bound is None else np.where(np.abs(tried) <= bound, cost, np.nan)
 
 
 def _cost(
@@ -201,12 +207,12 @@ def _cost(
     lag: int,
     fewest: float,
 ) -> np.ndarray:
-    """Costs (T,) of one lag of cameras a and b, see :class:`PairCosts`.
+    """Mean costs (K,) of one lag of cameras a and b, by body point.
 
     1. Each person of camera a is compared with the person of camera b who has the least mean
        epipolar distance over the whole recording.
     2. The median over time is subtracted from the distance x of each body point. The cost is
-       Geman and McClure's x^2 / (x^2 + s^2) with s = 6 px at 1080p, averaged over body points.
+       Geman and McClure's x^2 / (x^2 + s^2) with s = 6 px at 1080p.
     3. Costs of people are averaged with their amount of motion as weight, because a person who
        stands still agrees at any lag.
 
@@ -218,10 +224,9 @@ def _cost(
         fewest: least number of sets.
     """
     sets = len(rays_a)
-    result = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
     if at.stop - at.start < fewest:
-        return result
+        return np.full(rays_a.shape[2], np.nan)
     first, second = rays_a[at], rays_b[at.start + lag : at.stop + lag]
     distance = _sampson_distances(first, second, *epipolar)
     seen = np.isfinite(distance).sum(0, keepdims=True)
@@ -229,16 +234,15 @@ def _cost(
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
     size = known_mean(known_mean(np.moveaxis(np.abs(distance), -1, 0)))
     size[known.sum(0) < fewest] = np.nan
-    cost, weight = np.full((2, first.shape[1], len(first)), np.nan)
+    cost = np.full((first.shape[1], len(first), first.shape[2]), np.nan)
+    weight = cost.copy()
     for p in np.flatnonzero(np.isfinite(size).any(1)):
         own = distance[:, p, np.nanargmin(size[p])]
-        own = own[:, np.isfinite(own).any(0)]
         change = (own - known_median(own)) / 6.0  # px at 1080p, error at the right lag; tuned
-        cost[p] = known_mean((change**2 / (1 + change**2)).T)
+        cost[p] = change**2 / (1 + change**2)
         motion = 1e-6 + float(np.nanmean(np.sqrt(np.nanvar(first[:, p], axis=0).sum(-1))))  # rad
         weight[p] = np.where(np.isfinite(cost[p]), motion, np.nan)
-    result[at] = known_mean(weight * cost) / known_mean(weight)
-    return result
+    return known_mean(known_mean(weight * cost) / known_mean(weight))
 
 
 def _epipolar_geometry(rig: Rig, a: int, b: int) -> tuple[np.ndarray, float]:

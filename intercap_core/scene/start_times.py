@@ -4,24 +4,31 @@ The rays of two cameras to a moving person meet only if both images show the sam
 epipolar distance is therefore low at the right lag. For each pair of cameras and each lag, robust
 costs of these distances are averaged (:mod:`.start_costs`). The median distance of each body point
 is subtracted first, since it stems from the calibration. The delay of each camera minimises the
-costs of all its pairs. If the person hardly moves, or the motion is periodic, no start is returned.
+costs of all its pairs.
 
-The search begins at a stated start if there is one, else at the device times. The result differs
-from this initial value only if the cost is clearly lower elsewhere. If the difference exceeds the
-accuracy of a stated start, the statement is rejected.
+The search begins at a stated start if there is one, else at the device times. Each other camera
+alone has its own minimum: its vote. A delay is confirmed if
 
-Significance is tested on blocks of 0.3 s, whose cost differences count as independent.
+- a majority of the other cameras votes for it;
+- the minimum of all cameras stays if any camera or any group of joints is left out;
+- face, hands and feet, which the search does not use, have their minimum there;
+- it is not at an end of the search range.
+
+A camera is moved only if its delay is confirmed. A stated start is overruled only if all other
+cameras and all groups of joints vote for one delay beyond its bounds. A camera whose device time is
+not confirmed either is reported.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.start_costs import PairCosts, follow_rays, known_mean
+from intercap_core.scene.start_costs import SEARCHED, WITNESS, PairCosts, follow_rays
 from intercap_core.scene.starts import (
     FEWEST_SETS_APART,
     MIN_SHARED_S,
@@ -31,7 +38,13 @@ from intercap_core.scene.starts import (
     shift_images,
 )
 
-FEWEST_BLOCKS = 4  # least number of blocks for a significance test; tuned on the studio
+# Largest delay that is searched, seconds: cameras are started by hand, or by one command that
+# reaches them in turn; tuned on the studio. If a larger one fits better, the start is undetermined.
+MAX_DELAY_S = 1.5
+# Half width of a minimum, seconds: votes for the same delay differ by at most this or one set. A
+# time between images at 15 per second.
+VOTE_WIDTH_S = 1 / 15
+ALL_POINTS = tuple(k for points in SEARCHED.values() for k in points)
 
 
 def find_starts(
@@ -57,39 +70,38 @@ def find_starts(
     as_stated = StartTimes.as_stated(known, step)
     if sets < 2 or views < 2:
         return as_stated
-    # Largest delay: cameras are started by hand, or by one command that reaches them in turn.
-    # 1.5 s, at most 40 % of the recording; tuned on the studio.
     fewest = max(MIN_SHARED_S / step, 1)
-    reach = min(round(1.5 / step), int(0.4 * sets), int(sets - fewest))
-    if reach < 1:
+    # At most 40 % of the recording: the fewer images two cameras have in common, the more often
+    # they agree by chance.
+    limit = min(round(MAX_DELAY_S / step), int(0.4 * sets), int(sets - fewest))
+    if limit < 1:
         return replace(as_stated, too_short=True)
+    reach = min(2 * limit, int(sets - fewest))
     rays = shift_images(follow_rays(detections, rig, times, available), as_stated.sets, np.nan)
     search = _Search(
-        PairCosts.of(rays, rig, reach, fewest), master, step, known.bounds(step, reach), known.known
+        PairCosts.of(rays, rig, reach, fewest),
+        rig.names,
+        master,
+        max(1, round(VOTE_WIDTH_S / step)),
+        known.bounds(step, limit),
+        limit,
+        known.known,
     )
-    late, rejected = search.agreed()
-    others = [c for c in range(views) if c != master]
-    certain = {c: bool(rejected[c]) or search.is_apart(late, c) for c in others}
+    late, rejected, doubts = search.agreed()
+    moved = ~known.known & (np.abs(late) >= FEWEST_SETS_APART)
     # if one camera certainly started apart, the cameras were not started together
     result = replace(
         as_stated,
-        apart=any(certain.values()) or known.states_apart(step),
+        apart=bool((moved | rejected).any()) or known.states_apart(step),
         rejected=rejected,
-        beyond=tuple(c for c in others if search.is_beyond(late, c)),
+        undetermined=tuple(doubts),
     )
-    shown = search.shown(late)
-    for c in others:
-        if known.known[c] and not rejected[c] and not shown[c]:
-            continue
+    for c in np.flatnonzero(np.arange(views) != master).tolist():
         if not known.known[c] and not result.apart:
             continue
-        if not known.known[c]:
-            # If only a statement says that cameras started apart, nobody may move in the recording.
-            # A delay of FEWEST_SETS_APART or more is then not believed.
-            moves = any(certain.values()) or abs(late[c]) < FEWEST_SETS_APART
-            if not moves or not search.is_clear(late, c):
-                result.in_doubt[c] = True
-                continue
+        if doubts[c]:
+            result.in_doubt[c] = not known.known[c]
+            continue
         result.late[c] = (result.sets[c] + late[c] + search.between(late, c)) * step
         result.sets[c] += late[c]
         if rejected[c]:
@@ -110,54 +122,131 @@ class _Search:
 
     pairs: PairCosts
     """Costs by lag."""
+    names: Sequence[str]
+    """(C,) camera names, for messages."""
     master: int
     """Camera whose delay is 0."""
-    step: float
-    """Seconds per set."""
+    width: int
+    """Largest difference of two votes for the same delay, sets."""
     bounds: np.ndarray
-    """(C,) largest delays, sets, that do not contradict a stated start; ``reach`` without one."""
+    """(C,) largest delays, sets, that do not contradict a stated start; ``limit`` without one."""
+    limit: int
+    """Largest delay, sets, of the search."""
     stated: np.ndarray
     """(C,) bool: the start is stated."""
 
-    def agreed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Delays (C,), sets, of least cost, and a mask (C,) of rejected statements.
+    def agreed(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
+        """Delays that the evidence confirms.
 
-        Statements are rejected one after another, the clearest first, because a wrong one disturbs
-        the others.
+        Cameras whose delay is not confirmed return to their stated start or device times one after
+        another, the one with the fewest votes first, because a wrong delay disturbs the others.
+        Statements are rejected one after another for the same reason.
+
+        Returns:
+            Delays (C,), sets; 0 = not moved.
+            Mask (C,) of rejected statements.
+            By camera, the reason why its start is not confirmed; "" = it is.
         """
-        rejected = np.zeros(len(self.bounds), bool)
-        bounds = self.bounds.copy()
+        rejected, bounds = np.zeros(len(self.names), bool), self.bounds.copy()
+        doubts = [""] * len(self.names)
+        others = self._others(self.master)
         while True:
             late = self._descended(bounds)
-            doubtful = self.stated & ~rejected & (late != 0)
-            doubtful &= ~self.shown(late)
-            if doubtful.any():  # the motion does not confirm the deviation: keep the stated start
-                bounds[doubtful] = 0
+            doubtful = {c: doubt for c in others if late[c] and (doubt := self._doubt(late, c))}
+            if doubtful:
+                c = min(doubtful, key=lambda c: self._support(late, c, self.width))
+                doubts[c], bounds[c] = doubtful[c], 0
                 continue
-            gains = {
-                c: gain
-                for c in np.flatnonzero(self.stated & ~rejected).tolist()
-                if (gain := self._rejection_gain(late, c)) > 0
-            }
-            if not gains:
-                return late, rejected
-            rejected[max(gains, key=lambda c: gains[c])] = True
-            bounds = np.where(rejected, self.pairs.reach, self.bounds)
+            overruled = [c for c in others if not rejected[c] and self._is_overruled(late, c)]
+            if not overruled:
+                break
+            c = overruled[0]
+            rejected[c], doubts[c], bounds[c] = True, "", self.limit
+        for c in others:
+            if abs(late[c]) < FEWEST_SETS_APART and self._support(late, c, 0) <= 0.5:
+                late[c] = 0  # a smaller difference is a slip or an offset
+            if not late[c]:
+                unconfirmed = self._doubt(late, c)
+                doubts[c] = unconfirmed and (doubts[c] or unconfirmed)
+        return late, rejected, doubts
 
-    def _rejection_gain(self, late: np.ndarray, camera: int) -> float:
-        """Decrease of the cost if a camera leaves its bounds; 0 = not significant."""
-        profile = self.pairs.profile(camera, self._others(camera), late)
-        tried = np.arange(-self.pairs.reach, self.pairs.reach + 1)
-        if not np.isfinite(profile).any():
-            return 0.0
-        best = int(tried[np.nanargmin(profile)])
-        if abs(best) <= self.bounds[camera]:
-            return 0.0
+    def _is_overruled(self, late: np.ndarray, camera: int) -> bool:
+        """Whether all cameras and all groups of joints vote for one delay beyond the bounds."""
         there = late.copy()
-        there[camera] = best
-        if not self.is_apart(there, camera, int(late[camera])) or not self.is_clear(there, camera):
-            return 0.0
-        return float(self._worse(there, camera, int(late[camera])).mean())
+        vote = self._vote(late, camera, self._others(camera))
+        if not self.stated[camera] or not abs(vote) > self.bounds[camera]:
+            return False
+        there[camera] = int(vote)
+        by_camera, by_group = self._votes(there, camera)
+        unanimous = (np.abs(np.r_[by_camera, by_group] - vote) <= self.width).all()
+        return bool(unanimous) and not self._doubt(there, camera)
+
+    def _vote(
+        self,
+        late: np.ndarray,
+        camera: int,
+        others: Sequence[int],
+        points: Sequence[int] = ALL_POINTS,
+        bound: int | None = None,
+    ) -> float:
+        """Delay of least cost within the search range, sets; NaN = unknown.
+
+        For the arguments see :meth:`PairCosts.profile`.
+        """
+        bound = self.limit if bound is None else bound
+        profile = self.pairs.profile(camera, others, late, points, bound)
+        known = np.isfinite(profile).any()
+        return float(np.nanargmin(profile) - self.pairs.reach) if known else np.nan
+
+    def _votes(self, late: np.ndarray, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        """Known votes of each other camera alone, and of each group of joints alone."""
+        others = self._others(camera)
+        by_camera = np.array([self._vote(late, camera, [other]) for other in others])
+        by_group = np.array([self._vote(late, camera, others, p) for p in SEARCHED.values()])
+        return by_camera[np.isfinite(by_camera)], by_group[np.isfinite(by_group)]
+
+    def _support(self, late: np.ndarray, camera: int, width: int) -> float:
+        """Share of the votes within ``width`` sets of a camera's delay: those of the other cameras,
+        or with two cameras those of the groups of joints. 0 if there are none."""
+        by_camera, by_group = self._votes(late, camera)
+        votes = by_camera if len(self.names) > 2 else by_group
+        return float((np.abs(votes - late[camera]) <= width).mean()) if len(votes) else 0.0
+
+    def _doubt(self, late: np.ndarray, camera: int) -> str:
+        """Why a camera's delay is not confirmed; "" if it is.
+
+        Delays below :data:`FEWEST_SETS_APART` need a majority of the votes only, because most
+        cameras start together.
+        """
+        others, delay = self._others(camera), late[camera]
+        profile = self.pairs.profile(camera, others, late, ALL_POINTS)
+        known = np.flatnonzero(np.isfinite(profile)) - self.pairs.reach
+        if delay not in known:
+            return "too few of its images show a person whom others see"
+        # A larger delay than is searched must be known to all pairs and have the witness's support.
+        by_other = [self.pairs.profile(camera, [other], late, ALL_POINTS) for other in others]
+        whole = np.isfinite(by_other).sum(0) == np.isfinite(by_other).sum(0).max()
+        best = np.nanargmin(np.where(whole, profile, np.nan)) - self.pairs.reach
+        witness = self._vote(late, camera, others, WITNESS, self.pairs.reach)
+        is_beyond = abs(best) > self.limit and abs(best - delay) > self.width
+        is_moved = abs(delay) >= FEWEST_SETS_APART
+        at_end = is_moved and (abs(delay) == self.limit or delay in (known[0], known[-1]))
+        if at_end or (is_beyond and abs(witness - best) <= self.width):
+            return "its images agree best with the others at or beyond an end of the searched range"
+        if not is_moved:
+            is_kept = self._support(late, camera, self.width) > 0.5
+            return "" if is_kept else "the other cameras do not agree on one start"
+        for other in others if len(others) > 1 else []:
+            vote = self._vote(late, camera, [o for o in others if o != other])
+            if not abs(vote - delay) <= self.width:
+                return f"only camera {self.names[other]} shows it"
+        for group, points in SEARCHED.items():
+            rest = [k for k in ALL_POINTS if k not in points]
+            if not abs(self._vote(late, camera, others, rest) - delay) <= self.width:
+                return f"only {group} show it"
+        if abs(self._vote(late, camera, others, WITNESS) - delay) > self.width:
+            return "face, hands and feet do not confirm it"
+        return ""
 
     def _descended(self, bounds: np.ndarray) -> np.ndarray:
         """Delays (C,), in sets, that minimise the cost of all pairs within ``bounds`` (C,).
@@ -165,11 +254,15 @@ class _Search:
         Cameras are added one after another, the deepest minimum first. Then each camera's delay is
         improved in turn, at most five times (coordinate descent).
         """
-        pairs, master = self.pairs, self.master
-        sets, joined = np.zeros(pairs.views, int), [master]
-        waiting = [c for c in range(pairs.views) if c != master]
+        master = self.master
+        is_master = np.arange(len(self.names)) == master
+        bounds = np.where(is_master, self.limit, bounds)
+        sets, joined = np.zeros(len(self.names), int), [master]
+        waiting = self._others(self.master)
         while waiting:
-            profiles = {c: pairs.profile(c, joined, sets, int(bounds[c])) for c in waiting}
+            profiles = {
+                c: self.pairs.profile(c, joined, sets, ALL_POINTS, int(bounds[c])) for c in waiting
+            }
             # a camera with a stated start is added even if its profile is flat
             least = np.where(self.stated, np.finfo(float).tiny, 0.0)
             gains = {
@@ -178,117 +271,25 @@ class _Search:
             }
             c = max(waiting, key=lambda c: gains[c])
             if gains[c] > 0:
-                sets[c] = np.nanargmin(profiles[c]) - pairs.reach
+                sets[c] = np.nanargmin(profiles[c]) - self.pairs.reach
                 joined.append(c)
             waiting.remove(c)
         for _ in range(5):
             before = sets.copy()
-            for c in joined[1:]:
-                profile = pairs.profile(c, [o for o in joined if o != c], sets, int(bounds[c]))
-                if np.isfinite(profile).any():
-                    sets[c] = np.nanargmin(profile) - pairs.reach
+            for c in joined:
+                vote = self._vote(sets, c, [o for o in joined if o != c], bound=int(bounds[c]))
+                sets[c] = sets[c] if np.isnan(vote) else vote
+            # If the master itself moved, all others moved against it.
+            moved = np.where(np.isin(np.arange(len(sets)), joined), sets - sets[master], 0)
+            sets = moved if (np.abs(moved) <= bounds).all() else np.where(is_master, 0, sets)
             if (before == sets).all():
                 break
         return sets
 
-    def is_apart(self, sets: np.ndarray, camera: int, instead: int = 0) -> bool:
-        """Whether a camera's delay significantly differs from ``instead``, by at least
-        :data:`FEWEST_SETS_APART` sets. Smaller differences are slips or time offsets."""
-        if abs(sets[camera] - instead) < FEWEST_SETS_APART or self._at_end(sets, camera):
-            return False
-        return self._significant(self._worse(sets, camera, instead), sets, camera)
-
-    def is_beyond(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether a camera's delay is at an end of the searched range, and significant."""
-        return (
-            abs(sets[camera]) >= FEWEST_SETS_APART
-            and self._at_end(sets, camera)
-            and self._significant(self._worse(sets, camera, 0), sets, camera)
-        )
-
-    def _at_end(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether a camera's delay is the first or the last with a known cost: no minimum."""
-        profile = self.pairs.profile(camera, self._others(camera), sets)
-        known = np.flatnonzero(np.isfinite(profile)) - self.pairs.reach
-        return len(known) > 0 and sets[camera] in (known[0], known[-1])
-
-    def _significant(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
-        """Whether the cost increases ``worse`` (N,), by block, are significant.
-
-        They must be positive in 70 % of the blocks, and their mean above three standard errors and
-        20 % of the usual cost; tuned on the studio.
-        """
-        if len(worse) < FEWEST_BLOCKS:
-            return False
-        series = self.pairs.series(camera, int(sets[camera]), self._others(camera), sets)
-        usual = np.nanmean(series)
-        least = max(0.2 * usual, 3.0 * worse.std(ddof=1) / np.sqrt(len(worse)))
-        return bool((worse > 0).mean() >= 0.7 and worse.mean() > least)
-
-    def shown(self, sets: np.ndarray) -> np.ndarray:
-        """Mask (C,) of the cameras whose delays the motion confirms.
-
-        If the delay of one camera is significant, somebody moves. For the others a clear minimum of
-        the cost then suffices.
-        """
-        views = range(len(sets))
-        certain = np.array([c != self.master and self._is_shown(sets, c) for c in views])
-        if not certain.any():
-            return certain
-        return certain | [c != self.master and self.is_clear(sets, c, if_few=False) for c in views]
-
-    def _is_shown(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether a camera's delay significantly differs from 0, or from the next best delay."""
-        if self._at_end(sets, camera):
-            return False
-        if self.is_apart(sets, camera):
-            return True
-        next_best = self._next_best(sets, camera)
-        return next_best is not None and self._significant(
-            self._worse(sets, camera, next_best), sets, camera
-        )
-
-    def _next_best(self, sets: np.ndarray, camera: int) -> int | None:
-        """Best other delay, sets, more than 0.15 s from a camera's own; None if either cost is
-        unknown."""
-        pairs = self.pairs
-        profile = pairs.profile(camera, self._others(camera), sets)
-        tried = np.arange(-pairs.reach, pairs.reach + 1)
-        far = np.abs(tried - sets[camera]) * self.step > 0.15  # seconds; tuned on the studio
-        far &= np.isfinite(profile)
-        if not far.any() or not np.isfinite(profile[sets[camera] + pairs.reach]):
-            return None
-        return int(tried[far][profile[far].argmin()])
-
-    def is_clear(self, sets: np.ndarray, camera: int, *, if_few: bool = True) -> bool:
-        """Whether the cost at a camera's delay is one standard error below that at the next best.
-
-        ``if_few``: the answer if there are too few blocks.
-        """
-        next_best = self._next_best(sets, camera)
-        if next_best is None or self._at_end(sets, camera):
-            return False
-        worse = self._worse(sets, camera, next_best)
-        if len(worse) < FEWEST_BLOCKS:
-            return if_few
-        return bool(worse.mean() > worse.std(ddof=1) / np.sqrt(len(worse)))
-
-    def _worse(self, sets: np.ndarray, camera: int, late: int) -> np.ndarray:
-        """Cost at a delay of ``late`` sets minus that at the camera's own delay, by block (N,).
-
-        Blocks with fewer than half of their sets known are left out.
-        """
-        others = self._others(camera)
-        own = self.pairs.series(camera, int(sets[camera]), others, sets)
-        change = self.pairs.series(camera, late, others, sets) - own
-        size = max(1, round(0.3 / self.step))  # blocks of 0.3 s; tuned on the studio
-        whole = change[: len(change) // size * size].reshape(-1, size)
-        return known_mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
-
     def between(self, sets: np.ndarray, camera: int) -> float:
         """Sub-set part of a camera's delay, in sets, by a parabola through the cost."""
         place = sets[camera] + self.pairs.reach
-        profile = self.pairs.profile(camera, self._others(camera), sets)
+        profile = self.pairs.profile(camera, self._others(camera), sets, ALL_POINTS)
         profile = profile[max(place - 1, 0) : place + 2]
         if len(profile) < 3 or not np.isfinite(profile).all():
             return 0.0
@@ -298,7 +299,7 @@ class _Search:
         )
 
     def _others(self, camera: int) -> list[int]:
-        return [c for c in range(self.pairs.views) if c != camera]
+        return [c for c in range(len(self.names)) if c != camera]
 
 
 def _gain(profile: np.ndarray) -> float:

@@ -189,8 +189,8 @@ class StartTimes:
     NaN."""
     rejected: np.ndarray
     """(C,) bool: the keypoints contradict the stated start."""
-    beyond: tuple[int, ...] = ()
-    """Cameras whose images agree best at an end of the searched range."""
+    undetermined: tuple[str, ...] = ()
+    """(C,) reasons why the keypoints do not confirm a start, "" = they do; empty = not searched."""
     too_short: bool = False
     """The recording, or its number of frame sets, is too small for a search."""
 

@@ -387,17 +387,12 @@ def _notes(
         left, sigma = float(refined.offset[c]), float(refined.offset_sigma[c])
         note = describe_stated_start(stated, starts, moments.slips, c, left, sigma)
         notes[c] += [note] if note else []
-    for c in np.flatnonzero(starts.in_doubt).tolist():
-        notes[c].append(
-            "set aside: the cameras were not started together, and by how much this one is out of "
-            "step could not be told; state when it started (starts of the annotation)"
-        )
-    for c in starts.beyond:
-        if not starts.in_doubt[c]:
+    for c, doubt in enumerate(starts.undetermined):
+        if doubt and source.present[c] and not stated.known[c]:
+            aside = "; set aside, because the cameras were not started together"
             notes[c].append(
-                f"{NOT_DETERMINED}: its images agree best with the others at the end of the "
-                "searched range; if it is out of step, state when it started (starts of the "
-                "annotation)"
+                f"{NOT_DETERMINED}: {doubt}{aside if starts.in_doubt[c] else ''}; if it is out of "
+                "step, state when it started (starts of the annotation)"
             )
     if starts.too_short:
         notes[source.rig.names.index(source.master)].append(

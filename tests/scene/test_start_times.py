@@ -94,7 +94,10 @@ def test_bystander_who_stands_still_does_not_shift_cameras(apart):
     "apart", [pytest.param(False, marks=FULL), True], ids=["together", "apart"]
 )
 def test_another_person_in_one_view_affects_only_those_images(apart):
-    """The third camera shows a passer-by instead of the subject for two of five seconds."""
+    """The third camera shows a passer-by instead of the subject for two of five seconds.
+
+    If the cameras started apart, its own start may be undetermined, and is then named.
+    """
     fps, rng = 15.0, np.random.default_rng(12)
     late = np.r_[0.0, rng.uniform(-1, 1, VIEWS - 1)] * apart
     people = walk(late, fps, 5.0)
@@ -107,10 +110,13 @@ def test_another_person_in_one_view_affects_only_those_images(apart):
     for t in range(20, 50):
         people.images[t][2] = [other[t, 2]]
     result = moments_of(people, fps)
-    assert result.starts.apart == apart and not result.starts.in_doubt.any()
-    of_subject = (usual.image_of >= 0) & ~wrong[usual.image_of, np.arange(VIEWS)]
+    doubt = result.starts.in_doubt
+    assert result.starts.apart == apart and not doubt[[0, 1, 3, 4, 5]].any()
+    assert not doubt[2] or (apart and result.starts.undetermined[2])
+    of_subject = (usual.image_of >= 0) & ~wrong[usual.image_of, np.arange(VIEWS)] & ~doubt
     np.testing.assert_array_equal(result.image_of[of_subject], usual.image_of[of_subject])
-    assert np.abs(result.starts.sets / fps - result.timing.offset - late).max() < 0.005
+    error = np.abs(result.starts.sets / fps - result.timing.offset - late)
+    assert error[~doubt].max() < 0.005
 
 
 @pytest.mark.parametrize(
@@ -142,7 +148,7 @@ def test_optimum_at_the_end_of_the_search_is_named_and_refused():
     late = np.where(np.arange(VIEWS) == 2, 1.5, 0.0)  # 22 sets are searched
     starts = starts_of(walk(late, 15.0, 5.0), 15.0)
     assert not starts.apart and not starts.sets.any() and not starts.in_doubt.any()
-    assert starts.beyond == (2,)
+    assert "an end of the searched range" in starts.undetermined[2]
 
 
 def test_a_vague_statement_does_not_admit_an_optimum_at_the_end():
