@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core import artefacts
 from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.scene.camera_agreement import find_disagreements
 from intercap_core.scene.subject_views import find_subject_views
+from intercap_core.schemas import SCENE
 
 # A kicked tripod
 KICK_DEG, KICK_M = 5.0, 0.15
@@ -112,7 +114,7 @@ class NamedFault:
     """Causes in words."""
 
 
-def name_faults(frames: Path, detections: Path) -> list[NamedFault]:
+def name_faults(frames: Path, detections: Path, scene: Path) -> list[NamedFault]:
     """Make faulty recordings of a correct one and check which cameras are named.
 
     Raises UserError if an artefact cannot be read.
@@ -120,15 +122,15 @@ def name_faults(frames: Path, detections: Path) -> list[NamedFault]:
     with Frames.open(frames) as source:
         people, rig = Detections.load(detections), source.rig
         master, times = rig.names.index(source.master), source.time_s
-        sets = np.arange(source.num_sets)[:, None]
-        image_of = np.where(source.available, sets, -1)
+    with artefacts.read(scene, SCENE) as found:
+        image_of = found["image_of"]  # late images are no fault of the calibration
     result = []
     for fault, at_fault, altered, moved in faulty_cases(people, rig, master, len(times)):
-        subject = find_subject_views(altered, moved, times)
-        found = find_disagreements(altered, subject, image_of, moved)
-        named = {one.camera for one in found}
+        subject = find_subject_views(altered, moved, times).showing(image_of, moved)
+        disagreements = find_disagreements(altered, subject, image_of, moved)
+        named = {one.camera for one in disagreements}
         share = len(named & at_fault) / len(at_fault) if at_fault else float("nan")
-        causes = tuple(sorted({one.cause for one in found}))
+        causes = tuple(sorted({one.cause for one in disagreements}))
         # without a majority, no camera can be told to be right
         false = 0 if fault == "other session" else len(named - at_fault)
         result.append(NamedFault(fault, share, false, causes))

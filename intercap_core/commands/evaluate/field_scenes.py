@@ -38,7 +38,7 @@ def measure(project: Project, sequence: str) -> FieldScene:
     scene = field_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
     if not str(project.config.dataset).startswith(FLOOR):
         return scene
-    return replace(scene, faults=tuple(name_faults(paths.frames, paths.detections)))
+    return replace(scene, faults=tuple(name_faults(paths.frames, paths.detections, paths.scene)))
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
