@@ -18,10 +18,10 @@ from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
 # Half of the window around a frame, seconds: six frames at 30 Hz. Tuned on the studio.
 JUMP_WINDOW_S = 0.21
+FIT_SCATTER_M = 0.1  # fits of a still body scatter by less, metres; measured on the studio
 # Distance from the median of the window beyond which a joint jumps, metres. Hands accelerate by up
-# to 30 m/s^2 (anatomy): within 0.1 s they leave a straight path by 30 / 2 * 0.1^2 = 0.15 m. Fits
-# scatter by less than 0.1 m (measured on the studio).
-JUMP_M = 0.25
+# to 30 m/s^2 (anatomy): within 0.1 s they leave a straight path by 30 / 2 * 0.1^2 = 0.15 m.
+JUMP_M = FIT_SCATTER_M + 0.15
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 
@@ -50,7 +50,10 @@ def measure_jumps(
 
 
 def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
-    """Refit the frames that jump, starting from an interpolation of the others.
+    """Refit the frames that leave their neighbours, starting from an interpolation of the others.
+
+    These are frames with a joint farther than :data:`FIT_SCATTER_M` from the median of its window.
+    A fast motion may be among them: its refit ends where the fit was.
 
     Args:
         problem: a problem with views, whose ``base`` is changed in place. Shared parameters do not
@@ -58,15 +61,16 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
         times: (N,) seconds.
 
     Returns:
-        (N,) bool, the frames that were changed.
+        (N,) bool, frames whose refit costs clearly less: their energy has several minima.
     """
     model = problem.model
-    changed = np.zeros(len(times), bool)
+    improved = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
     joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
-    jumped = np.asarray((measure_jumps(joints.double().numpy(), times) > 0).any(1))
+    jumps = measure_jumps(joints.double().numpy(), times, FIT_SCATTER_M)
+    jumped = np.asarray((jumps > 0).any(1))
     if not jumped.any() or jumped.all():
-        return changed
+        return improved
     between = bridge(problem.base.double().numpy(), ~jumped, times)
     at = torch.as_tensor(np.flatnonzero(jumped))
     base = torch.as_tensor(between[jumped]).to(problem.base)
@@ -82,8 +86,8 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     rows[kept] = again.base[kept]
     problem.base = problem.base.clone()
     problem.base[at] = rows
-    changed[np.flatnonzero(jumped)[kept.numpy()]] = True
-    return changed
+    improved[jumped] = (before > 1.2 * solution.cost + 5.0).numpy()
+    return improved
 
 
 def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> BodyProblem:

@@ -94,6 +94,8 @@ class BodyFit:
     """Quantities that all frames share."""
     parts: PartEvidence
     """Support of each part of the body by the observations."""
+    refitted: np.ndarray
+    """(N,) bool: the energy of the frame has several minima (:func:`.recover.recover`)."""
 
 
 class Fitter:
@@ -154,7 +156,7 @@ class Fitter:
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
             problem.targets = None
-        recover(problem, evidence.observations.times[self.frames])
+        refitted = recover(problem, evidence.observations.times[self.frames])
         if hands or face:
             self._fit_extremities(problem)
         # Shared parameters stay free. The hands, which are fitted now, determine the lengths of
@@ -169,7 +171,7 @@ class Fitter:
             evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4, keep_normal=last)
         assert solution.normal is not None
-        return self._report(problem, solution.normal.hessian)
+        return self._report(problem, solution.normal.hessian, refitted)
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
         """Return the problem of stage 5 at other bodies ``base`` (N, P), without observations.
@@ -235,7 +237,7 @@ class Fitter:
         pixels = residuals[:, :, BODY].norm(dim=-1)
         return torch.where(problem.views.confidence[:, :, BODY] > 0, pixels, torch.nan)
 
-    def _report(self, problem: BodyProblem, hessian: Tensor) -> BodyFit:
+    def _report(self, problem: BodyProblem, hessian: Tensor, refitted: np.ndarray) -> BodyFit:
         """Return the solution with its residuals."""
         assert problem.views is not None
         evidence, views, index = self.evidence, problem.views, problem.keypoints.index
@@ -267,6 +269,7 @@ class Fitter:
                 evidence.keypoint_sigma[index],
                 None if problem.rows is None else (evidence.sample_joints, evidence.measured),
             ),
+            refitted=refitted,
         )
 
     def _minimise(self, problem: BodyProblem, trials: int, keep_normal: bool = False) -> Solution:

@@ -151,9 +151,9 @@ def _state_uncertainty(
     sigma = np.zeros((count, 55))
     stated = joint_covariance(model, fit).numpy()
     # A jump of a joint may be a wrong minimum, so it widens sigma. Jumps count from JUMP_M on; for
-    # joints that only keypoints of one view constrain, from 0 on.
+    # joints that only keypoints of one view constrain, and in refitted frames, from 0 on.
     least = np.full_like(sigma, JUMP_M)
-    least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
+    least[fit.frames] *= ~(quality.flag_unmeasured_joints(fit.parts) | fit.refitted[:, None])
     jumped = np.zeros_like(sigma)
     jumped[fitted] = measure_jumps(joints[fitted].astype(float), times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(

@@ -149,11 +149,14 @@ def test_a_body_in_another_minimum_is_refitted(body: BodyModel) -> None:
         if learned:
             sure = 1e6 * torch.eye(63).expand(count, 63, 63)
             problem.pose = PoseGaussian(truth[:, 3:66].clone(), sure)
-        changed = recover(problem, np.arange(count) / 15)
-        assert np.flatnonzero(changed).tolist() == [odd]
+        improved = recover(problem, np.arange(count) / 15)
+        assert np.flatnonzero(improved).tolist() == [odd]
         off = (model.keypoints_of(model.parameters(problem.base)) - points).norm(dim=-1).amax(1)
         assert off[odd] < 0.02  # of 135 points; the arm was 1 m off
         others = torch.arange(count) != odd
         assert torch.equal(problem.base[others], truth[others])
+        fast = problem.base.clone()
+        assert not recover(problem, np.arange(count) / 15).any()
+        assert torch.equal(problem.base, fast)
         if learned:
             assert (problem.base - truth)[odd, 3:66].abs().max() < 0.01

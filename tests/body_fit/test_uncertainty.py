@@ -27,7 +27,7 @@ def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> B
     return BodyFit(
         np.arange(frames), vectors, columns, hessian, True, torch.full((SHARED,), counts),
         torch.full((frames,), excess), nothing, nothing,
-        Settled(*[nothing] * 5), PartEvidence(*[nothing] * 5),
+        Settled(*[nothing] * 5), PartEvidence(*[nothing] * 5), np.zeros(frames, bool),
     )  # fmt: skip
 
 
