@@ -380,7 +380,7 @@ JOINT = Schema(
         "hand_undetermined": Field(
             ("T", "2"),
             "bool",
-            "left and right hand: the observations do not determine it or contradict it; the frame is not flagged for this reason",
+            "left and right hand: the deviation of its finger joints is above 13 mm, also with the frames around; the frame is not flagged for this reason",
         ),
         "flagged": Field(("T",), "bool", "body or object of this frame are not reliable"),
         "flag_reason": Field(("T",), "str", "reasons in words; empty = not flagged"),

@@ -8,11 +8,13 @@ from math import radians
 import numpy as np
 
 from intercap_core.artefacts import Artefact
+from intercap_core.body.joints import FIRST_FINGER
 from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
+from intercap_core.body_fit.quality import LARGEST_HAND_SIGMA_M
 from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
+from intercap_core.joint.hand_track import smooth_hands
 from intercap_core.joint.state import State
-from intercap_core.joint.undetermined_hands import interpolate_hands
 
 POSE_NAMES = (*POSE_COLUMNS, "transl")
 """Datasets with a frame's pose and translation, in the order of the parameter vector."""
@@ -145,8 +147,13 @@ class SequentialFits:
         failed, lost = body["failed"], track["lost"]
         named = bool(track.attributes["object"])
         filled = failed | body["bridged"]
-        parts = body.text("part_names")
-        hands = body["undetermined"][:, [parts.index(f"{s}_hand") for s in ("left", "right")]]
+        fingers = body["joint_sigma"][:, FIRST_FINGER:].astype(float).reshape(-1, 2, 15)
+        state, hand_sigma = smooth_hands(
+            state,
+            body["joints"].astype(float),
+            np.sqrt(np.square(fingers).mean(axis=2)),
+            float(scene.attributes["fps"]),
+        )
         carried = np.asarray(track["carried"] if "carried" in track else np.zeros_like(lost))
         marks = TrackMarks(lost, track["ambiguous"], carried, track["resting"])
         flags = SequentialFlags(
@@ -155,11 +162,8 @@ class SequentialFits:
             lost=lost & named,
             ambiguous=marks.ambiguous,
             carried=carried,
-            hands=hands | filled[:, None],
+            hands=(hand_sigma > LARGEST_HAND_SIGMA_M) | filled[:, None],
         )
-        times = scene["times"]
-        fps = 1 / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-        state = interpolate_hands(state, hands, fps)
         tracked = None
         if lost.all():
             state = state.without_object()

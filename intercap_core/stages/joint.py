@@ -16,14 +16,13 @@ import torch
 from intercap_core import artefacts
 from intercap_core.annotation import ContactInterval
 from intercap_core.body.artefact import put_parameters
-from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.config import digest
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.fit import fit
 from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
 from intercap_core.joint.result import Convergence, JointFit
-from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
+from intercap_core.schemas import CONTACT_REGIONS, JOINT
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
@@ -77,20 +76,8 @@ def run(
             joints = inputs.model(parameters, vertex_ids=np.array([0])).joints.numpy()
         put_parameters(writer, parameters, joints, betas=fitted.state.betas)
         _put_fit(writer, fitted)
-        undetermined = inputs.sequential.flags.hands | _hands_of_few_views(paths.person)
-        writer.put("hand_undetermined", undetermined)
+        writer.put("hand_undetermined", inputs.sequential.flags.hands)
         _put_cameras(writer, inputs.cameras)
-
-
-def _hands_of_few_views(person: Path) -> np.ndarray:
-    """Mask (T, 2) of left and right hands whose keypoints have a median of at most two views.
-
-    If an object occludes the hand in the other views, it also occludes some fingers in these two.
-    """
-    with artefacts.read(person, PERSON) as artefact:
-        views = artefact["joint_views"]
-    few = [np.median(views[:, hand], axis=1) <= 2 for hand in (LEFT_HAND, RIGHT_HAND)]
-    return np.stack(few, axis=1)
 
 
 def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:

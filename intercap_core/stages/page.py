@@ -151,7 +151,7 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
         corrected = f"; cameras corrected, mm over 2 m: {cameras}"
     frames = joint["hand_undetermined"].sum(axis=0)
     hands = "".join(
-        f" The {side} hand is undetermined in {count} frames (few views see it)."
+        f" The {side} hand is undetermined in {count} frames."
         for side, count in zip(("left", "right"), frames, strict=True)
         if count
     )

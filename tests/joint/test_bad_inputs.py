@@ -16,12 +16,13 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.lemo import MotionEncoder
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
-from intercap_core.schemas import BODY_PARTS, CONTACT_REGIONS, JOINT
+from intercap_core.schemas import CONTACT_REGIONS, JOINT
 from intercap_core.sequence_inputs import FitSettings
 from intercap_core.stages import joint
 from tests.helpers import fitted_capture as fitted
@@ -185,14 +186,10 @@ def test_undetermined_hand_is_marked_but_not_flagged(captures, tmp_path):
     ball = HeldBall.copied(captures(3), tmp_path)
     ball.put("scene", ground_found=False)
     with h5py.File(ball.paths["body_fit"], "r+") as file:
-        del file["part_names"], file["undetermined"]
-        file["part_names"] = np.array(BODY_PARTS, "S")
-        undetermined = np.zeros((3, len(BODY_PARTS)), bool)
-        undetermined[1, [BODY_PARTS.index(part) for part in ("right_hand", "left_arm")]] = True
-        file["undetermined"] = undetermined
+        file["joint_sigma"][:, JOINT_INDEX["right_index1"] :] = 0.1
         file["bridged"][2] = True
     result = ball.run()
-    assert result["hand_undetermined"].tolist() == [[False, False], [False, True], [True, True]]
+    assert result["hand_undetermined"].tolist() == [[False, True], [False, True], [True, True]]
     assert not result["flagged"][1]
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.equations import BandedEquations
+from intercap_core.joint.hand_track import window_displacement, window_frames
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.term import (
@@ -132,14 +133,9 @@ class Stick(JointTerm):
         whose jitter is that of a step over the root of the number of frames. 20 mm beyond this
         jitter count a quarter. Both are tuned on the studio.
         """
-        half = max(1, round(0.2 * self._fps))
-        total = np.concatenate([np.zeros_like(local[:1]), local.cumsum(axis=0)])
-        step = np.arange(max(len(local) - 1, 0))
-        first, last = np.maximum(step + 1 - half, 0), np.minimum(step + 1 + half, len(local))
-        before = (total[step + 1] - total[first]) / (step + 1 - first)[:, None, None]
-        after = (total[last] - total[step + 1]) / (last - step - 1)[:, None, None]
-        way = np.square(after - before).sum(axis=2)
-        return geman_mcclure_weight(way, np.hypot(0.02, 2 * jitter / np.sqrt(half)))
+        way = np.square(window_displacement(local, self._fps))
+        frames = window_frames(self._fps)
+        return geman_mcclure_weight(way, np.hypot(0.02, 2 * jitter / np.sqrt(frames)))
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the slip of the vertices of the last :meth:`refresh`."""
