@@ -200,8 +200,21 @@ class KeypointMotion:
 
         ``offset``: (C,) seconds by which each camera exposes late.
         """
-        along = np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
-        return replace(self, residual=self.residual - along)
+        return replace(self, residual=self.residual - self._displaced(offset))
+
+    def _displaced(self, offset: np.ndarray) -> np.ndarray:
+        """Displacement (T, C, K, 2) of seen keypoints by time offsets (C,), px."""
+        return np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
+
+    def without_offsets(self, keypoints: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Keypoints (T, C, 135, 3) with the effect of known time offsets removed from the compared
+        ones.
+
+        ``offset``: (C,) seconds by which each camera exposes late.
+        """
+        moved = keypoints.copy()
+        moved[:, :, POINTS, :2] -= self._displaced(offset)
+        return moved
 
     def shifted(self, seconds: float) -> np.ndarray:
         """Displacement (T, C, K, 2), px, of the points in images that are ``seconds`` older than

@@ -142,11 +142,16 @@ def find_offsets(
         unknown = np.where(np.arange(views) == master, 0.0, np.nan)
         return TimeOffsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
     motion = build_motion(shown, rig, times)
-    if start is None or not start.any():
-        return estimate_offsets(motion, master)
-    offsets = estimate_offsets(motion.at_offsets(start), master)
+    start = np.zeros(views) if start is None else start
+    first = start + estimate_offsets(motion.at_offsets(start), master).offset
+    # Paths of views that are apart in time are wrong in proportion to the offsets, and so are the
+    # first estimates: new paths from keypoints without the effect of the offsets.
+    again = build_motion(motion.without_offsets(shown, first), rig, times)
+    change = estimate_offsets(again, master)
     return replace(
-        offsets, offset=offsets.offset + start, vector=offsets.vector + offsets.information @ start
+        change,
+        offset=np.where(np.isfinite(change.sigma), first + change.offset, start),
+        vector=change.vector + change.information @ first,
     )
 
 
@@ -179,8 +184,7 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     offset, sigma = np.zeros(views), np.zeros(views)
     offset[free[own]] = solution[free[own]]
     random = inflation * np.diag(covariance)[own]
-    # smoothing makes speeds, and so offsets, wrong by 8 %; tuned on the studio
-    sigma[free[own]] = np.sqrt(random + (0.08 * offset[free[own]]) ** 2)
+    sigma[free[own]] = np.sqrt(random)
     # less certain offsets than to 20 ms are unknown; tuned on the studio
     unknown = sigma > 0.02
     offset[unknown], sigma[unknown] = 0.0, np.nan
