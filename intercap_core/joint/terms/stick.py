@@ -130,12 +130,12 @@ class Stick(JointTerm):
         """Weights (T - 1, M) of patch vertices by their displacement over the object.
 
         The displacement leads from the mean place of the last 0.2 s to that of the next 0.2 s,
-        whose jitter is that of a step over the root of the number of frames. 20 mm beyond this
+        whose jitter is that of a step over the root of the number of frames. 10 mm beyond this
         jitter count a quarter. Both are tuned on the studio.
         """
         way = np.square(window_displacement(local, self._fps))
         frames = window_frames(self._fps)
-        return geman_mcclure_weight(way, np.hypot(0.02, 2 * jitter / np.sqrt(frames)))
+        return geman_mcclure_weight(way, np.hypot(0.01, 2 * jitter / np.sqrt(frames)))
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the slip of the vertices of the last :meth:`refresh`."""
