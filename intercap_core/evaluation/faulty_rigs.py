@@ -62,8 +62,8 @@ def faulty_cases(
 ) -> Iterator[tuple[str, frozenset[int], PeopleOfImages, Rig]]:
     """Name of the fault (:data:`FAULTS`), cameras at fault, detections and rig of each case.
 
-    Exchanges need three cameras and another session four: with fewer, no camera can be told from
-    the others.
+    Exchanges need three cameras and another session four: with fewer, the faulty one cannot be
+    identified.
     """
     rng = np.random.default_rng(seed)
     count = len(rig)
@@ -131,7 +131,7 @@ def name_faults(frames: Path, detections: Path, scene: Path) -> list[NamedFault]
         named = {one.camera for one in disagreements}
         share = len(named & at_fault) / len(at_fault) if at_fault else float("nan")
         causes = tuple(sorted({one.cause for one in disagreements}))
-        # without a majority, no camera can be told to be right
+        # without a majority, it is undetermined which camera is correct
         false = 0 if fault == "other session" else len(named - at_fault)
         result.append(NamedFault(fault, share, false, causes))
     return result

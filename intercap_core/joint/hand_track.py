@@ -159,13 +159,13 @@ def _square_angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray(np.square(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
 
 
-def _variances(diagonal: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Diagonal (T,) of the inverse of a symmetric tridiagonal matrix; ``beside`` (T - 1,)."""
+def _variances(diagonal: np.ndarray, off_diagonal: np.ndarray) -> np.ndarray:
+    """Diagonal (T,) of the inverse of a symmetric tridiagonal matrix; ``off_diagonal`` (T - 1,)."""
     forward, backward = diagonal.copy(), diagonal.copy()
-    for k, value in enumerate(np.square(beside)):
+    for k, value in enumerate(np.square(off_diagonal)):
         forward[k + 1] -= value / forward[k]
-    for k in range(len(beside) - 1, -1, -1):
-        backward[k] -= beside[k] ** 2 / backward[k + 1]
+    for k in range(len(off_diagonal) - 1, -1, -1):
+        backward[k] -= off_diagonal[k] ** 2 / backward[k + 1]
     return np.asarray(1 / (forward + backward - diagonal))
 
 

@@ -211,7 +211,7 @@ def flat(evaluations: Sequence[DetectorSequences]) -> Figures:
 
 
 def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
-    """Print the errors of each recording, and the stated errors beside the true ones."""
+    """Print the errors of each recording, and the stated and the true errors."""
     columns = [*FIGURES, "grip_slip_mm"]
     heads = [name.replace("_mm", " mm").replace("_", " ") for name in columns]
     for found in evaluations:
@@ -242,7 +242,7 @@ def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
 
 
 def statement(error: StatedError) -> str:
-    """Text of the true error beside the stated one, such as ``12.0*: 8.0 (6.0 to 10.7)``."""
+    """Text of the true and the stated error, such as ``12.0*: 8.0 (6.0 to 10.7)``."""
     true = number(error.true, 1)
     if not np.isfinite(error.stated):
         return f"{true}: none stated" if true else ""
