@@ -243,14 +243,18 @@ def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
 
 
 def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: Console) -> None:
-    """Run the workflows in their order, ``parallel`` at a time, until all have ended."""
+    """Run the workflows in their order, ``parallel`` at a time, until all have ended.
+
+    The workflows that can run share the cores equally: one alone gets all of them.
+    """
     begin = reported = time.monotonic()
     while any(run.status is None for run in runs):
         running = [o for o in runs if o.process is not None and o.status is None]
         waiting = [o for o in runs if o.process is None and o.status is None]
         ready = [o for o in waiting if all(other.status is not None for other in o.after)]
+        together = min(parallel, len(running) + len(ready))
         for run in ready[: parallel - len(running)]:
-            _start(run, -(-cores // parallel), lock, console)
+            _start(run, -(-cores // together), lock, console)
         time.sleep(POLL_SECONDS)
         for run in running:
             assert run.process is not None and run.watcher is not None
