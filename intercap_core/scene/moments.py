@@ -64,6 +64,21 @@ def check_stated_starts(
     )
 
 
+def name_doubtful_delays(starts: StartTimes, slips: Slips) -> StartTimes:
+    """Name the cameras whose usual delay beyond ``starts.sets`` the searches of starts and slips
+    estimate differently. A set of difference is left to the time offsets."""
+    if starts.short is None:
+        return starts
+    differ = np.abs(starts.short - np.median(slips.slip, axis=0)) > 1
+    return replace(
+        starts,
+        undetermined=tuple(
+            reason or ("two estimates of a short delay differ" if doubt else "")
+            for reason, doubt in zip(starts.undetermined, differ, strict=True)
+        ),
+    )
+
+
 def describe_stated_start(
     stated: StatedStarts,
     starts: StartTimes,
@@ -148,6 +163,7 @@ def find_moments(
     )
     subject = find_subject_views(AlignedPeople(detections, starts), rig, times)
     slips = find_slips(subject.keypoints, rig, times, fps, master=master)
+    starts = name_doubtful_delays(starts, slips)
     slip = starts.with_slips(slips.slip)
     image_of = images_of_moments(slip, available & ~starts.in_doubt)
     keypoints = shift_images(subject.keypoints, -starts.sets)

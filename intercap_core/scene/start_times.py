@@ -14,9 +14,10 @@ alone has its own minimum: its vote. A delay is confirmed if
 - face, hands and feet, which the search does not use, have their minimum there;
 - it is not at an end of the search range.
 
-A camera is moved only if its delay is confirmed. A stated start is overruled only if all other
-cameras and all groups of joints vote for one delay beyond its bounds. A camera whose device time is
-not confirmed either is reported.
+A camera is moved only if its delay is confirmed. If no camera's delay is longer than a slip, the
+cameras were started together, and :mod:`.slips` decides whether a short delay is constant. A stated
+start is overruled only if all other cameras and all groups of joints vote for one delay beyond its
+bounds. A camera whose device time is not confirmed either is reported.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ import numpy as np
 
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.scene.slips import longest_slip
 from intercap_core.scene.start_costs import SEARCHED, WITNESS, PairCosts, follow_rays
 from intercap_core.scene.starts import (
-    FEWEST_SETS_APART,
     MIN_SHARED_S,
     StartTimes,
     StatedStarts,
@@ -85,16 +86,20 @@ def find_starts(
         max(1, round(VOTE_WIDTH_S / step)),
         known.bounds(step, limit),
         limit,
+        longest_slip(1 / step),
         known.known,
     )
     late, rejected, doubts = search.agreed()
-    moved = ~known.known & (np.abs(late) >= FEWEST_SETS_APART)
     # if one camera certainly started apart, the cameras were not started together
+    moved = ~known.known & (np.abs(late) > search.slip)
+    apart = bool((moved | rejected).any()) or known.states_apart(step)
+    whole = late if apart else np.where(np.abs(late) > search.slip, late, 0)
     result = replace(
         as_stated,
-        apart=bool((moved | rejected).any()) or known.states_apart(step),
+        apart=apart,
         rejected=rejected,
         undetermined=tuple(doubts),
+        short=late - whole,
     )
     for c in np.flatnonzero(np.arange(views) != master).tolist():
         if not known.known[c] and not result.apart:
@@ -102,8 +107,8 @@ def find_starts(
         if doubts[c]:
             result.in_doubt[c] = not known.known[c]
             continue
-        result.late[c] = (result.sets[c] + late[c] + search.between(late, c)) * step
-        result.sets[c] += late[c]
+        result.sets[c] += whole[c]
+        result.late[c] = (result.sets[c] + search.between(late, c)) * step
         if rejected[c]:
             result.sigma[c] = np.nan
         elif known.known[c] and known.sigma[c] > step / 2:
@@ -132,43 +137,44 @@ class _Search:
     """(C,) largest delays, sets, that do not contradict a stated start; ``limit`` without one."""
     limit: int
     """Largest delay, sets, of the search."""
+    slip: int
+    """Longest slip, sets. Shorter delays are not tested here."""
     stated: np.ndarray
     """(C,) bool: the start is stated."""
 
     def agreed(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
         """Delays that the evidence confirms.
 
-        Cameras whose delay is not confirmed return to their stated start or device times one after
+        Delays are tested relative to the majority of the cameras, because the master may be the
+        camera that started apart. Cameras whose delay is not confirmed are left out one after
         another, the one with the fewest votes first, because a wrong delay disturbs the others.
         Statements are rejected one after another for the same reason.
 
         Returns:
-            Delays (C,), sets; 0 = not moved.
+            Delays (C,), sets, relative to the master; 0 = not confirmed.
             Mask (C,) of rejected statements.
             By camera, the reason why its start is not confirmed; "" = it is.
         """
-        rejected, bounds = np.zeros(len(self.names), bool), self.bounds.copy()
-        doubts = [""] * len(self.names)
-        others = self._others(self.master)
+        cameras = range(len(self.names))
+        rejected, bounds = np.zeros(len(cameras), bool), self.bounds.copy()
+        used, doubts = np.ones(len(cameras), bool), [""] * len(cameras)
         while True:
-            late = self._descended(bounds)
-            doubtful = {c: doubt for c in others if late[c] and (doubt := self._doubt(late, c))}
+            late = self._descended(bounds, used)
+            doubtful = {c: doubt for c in cameras if late[c] and (doubt := self._doubt(late, c))}
             if doubtful:
-                c = min(doubtful, key=lambda c: self._support(late, c, self.width))
-                doubts[c], bounds[c] = doubtful[c], 0
+                c = min(doubtful, key=lambda c: self._support(late, c))
+                doubts[c], used[c] = doubtful[c], False
                 continue
-            overruled = [c for c in others if not rejected[c] and self._is_overruled(late, c)]
+            overruled = [c for c in cameras if not rejected[c] and self._is_overruled(late, c)]
             if not overruled:
                 break
             c = overruled[0]
-            rejected[c], doubts[c], bounds[c] = True, "", self.limit
-        for c in others:
-            if abs(late[c]) < FEWEST_SETS_APART and self._support(late, c, 0) <= 0.5:
-                late[c] = 0  # a smaller difference is a slip or an offset
-            if not late[c]:
+            rejected[c], doubts[c], bounds[c], used[c] = True, "", self.limit, True
+        for c in cameras:
+            if abs(late[c]) <= self.slip:
                 unconfirmed = self._doubt(late, c)
                 doubts[c] = unconfirmed and (doubts[c] or unconfirmed)
-        return late, rejected, doubts
+        return np.where(used, late - late[self.master], 0), rejected, doubts
 
     def _is_overruled(self, late: np.ndarray, camera: int) -> bool:
         """Whether all cameras and all groups of joints vote for one delay beyond the bounds."""
@@ -205,18 +211,18 @@ class _Search:
         by_group = np.array([self._vote(late, camera, others, p) for p in SEARCHED.values()])
         return by_camera[np.isfinite(by_camera)], by_group[np.isfinite(by_group)]
 
-    def _support(self, late: np.ndarray, camera: int, width: int) -> float:
-        """Share of the votes within ``width`` sets of a camera's delay: those of the other cameras,
-        or with two cameras those of the groups of joints. 0 if there are none."""
+    def _support(self, late: np.ndarray, camera: int) -> float:
+        """Share of the votes for a camera's delay: those of the other cameras, or with two cameras
+        those of the groups of joints. 0 if there are none."""
         by_camera, by_group = self._votes(late, camera)
         votes = by_camera if len(self.names) > 2 else by_group
-        return float((np.abs(votes - late[camera]) <= width).mean()) if len(votes) else 0.0
+        return float((np.abs(votes - late[camera]) <= self.width).mean()) if len(votes) else 0.0
 
     def _doubt(self, late: np.ndarray, camera: int) -> str:
         """Why a camera's delay is not confirmed; "" if it is.
 
-        Delays below :data:`FEWEST_SETS_APART` need a majority of the votes only, because most
-        cameras start together.
+        Delays that a slip may explain need a majority of the votes only, because most cameras start
+        together.
         """
         others, delay = self._others(camera), late[camera]
         profile = self.pairs.profile(camera, others, late, ALL_POINTS)
@@ -229,12 +235,12 @@ class _Search:
         best = np.nanargmin(np.where(whole, profile, np.nan)) - self.pairs.reach
         witness = self._vote(late, camera, others, WITNESS, self.pairs.reach)
         is_beyond = abs(best) > self.limit and abs(best - delay) > self.width
-        is_moved = abs(delay) >= FEWEST_SETS_APART
+        is_moved = abs(delay) > self.slip
         at_end = is_moved and (abs(delay) == self.limit or delay in (known[0], known[-1]))
         if at_end or (is_beyond and abs(witness - best) <= self.width):
             return "its images agree best with the others at or beyond an end of the searched range"
         if not is_moved:
-            is_kept = self._support(late, camera, self.width) > 0.5
+            is_kept = self._support(late, camera) > 0.5
             return "" if is_kept else "the other cameras do not agree on one start"
         for other in others if len(others) > 1 else []:
             vote = self._vote(late, camera, [o for o in others if o != other])
@@ -248,17 +254,23 @@ class _Search:
             return "face, hands and feet do not confirm it"
         return ""
 
-    def _descended(self, bounds: np.ndarray) -> np.ndarray:
-        """Delays (C,), in sets, that minimise the cost of all pairs within ``bounds`` (C,).
+    def _descended(self, bounds: np.ndarray, used: np.ndarray) -> np.ndarray:
+        """Delays (C,), in sets, that minimise the cost of all pairs of the ``used`` (C,) cameras
+        within ``bounds`` (C,).
 
-        Cameras are added one after another, the deepest minimum first. Then each camera's delay is
-        improved in turn, at most five times (coordinate descent).
+        They are relative to the majority of the cameras if these agree, else to the master. Cameras
+        are added one after another, the deepest minimum first. Then each camera's delay is improved
+        in turn, at most five times (coordinate descent).
         """
-        master = self.master
-        is_master = np.arange(len(self.names)) == master
-        bounds = np.where(is_master, self.limit, bounds)
-        sets, joined = np.zeros(len(self.names), int), [master]
-        waiting = self._others(self.master)
+        waiting = np.flatnonzero(used).tolist()
+        sets = np.zeros(len(used), int)
+        if not waiting:
+            return sets
+        first = self.master if used[self.master] else waiting[0]
+        waiting.remove(first)
+        joined = [first]
+        is_first = np.arange(len(used)) == first
+        bounds = np.where(is_first, self.limit, bounds)
         while waiting:
             profiles = {
                 c: self.pairs.profile(c, joined, sets, ALL_POINTS, int(bounds[c])) for c in waiting
@@ -279,11 +291,14 @@ class _Search:
             for c in joined:
                 vote = self._vote(sets, c, [o for o in joined if o != c], bound=int(bounds[c]))
                 sets[c] = sets[c] if np.isnan(vote) else vote
-            # If the master itself moved, all others moved against it.
-            moved = np.where(np.isin(np.arange(len(sets)), joined), sets - sets[master], 0)
-            sets = moved if (np.abs(moved) <= bounds).all() else np.where(is_master, 0, sets)
+            # If the first camera moved, all others moved against it.
+            moved = np.where(np.isin(np.arange(len(sets)), joined), sets - sets[first], 0)
+            sets = moved if (np.abs(moved) <= bounds).all() else np.where(is_first, 0, sets)
             if (before == sets).all():
                 break
+        values, counts = np.unique(sets[joined], return_counts=True)
+        common = values[counts.argmax()] if counts.max() > len(used) / 2 else 0
+        sets[joined] -= common
         return sets
 
     def between(self, sets: np.ndarray, camera: int) -> float:

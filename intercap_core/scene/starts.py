@@ -23,7 +23,6 @@ from intercap_core.formats.detections.read import PeopleOfImages
 # studio.
 PRIOR_OFFSET_S = 0.01
 NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
-FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a late start; tuned
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 # Combined standard deviations beyond which keypoints overrule a stated start. At three, about one
 # correct statement in 400 would be overruled by chance.
@@ -101,9 +100,9 @@ class StatedStarts:
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
     def states_apart(self, step_s: float) -> bool:
-        """Whether a statement contradicts the images' own times by at least
-        :data:`FEWEST_SETS_APART` sets beyond its accuracy."""
-        least = FEWEST_SETS_APART * step_s + REJECTED_SIGMAS * self.sigma
+        """Whether a statement contradicts the images' own times by at least two sets beyond its
+        accuracy."""
+        least = 2 * step_s + REJECTED_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
@@ -191,6 +190,9 @@ class StartTimes:
     """(C,) bool: the keypoints contradict the stated start."""
     undetermined: tuple[str, ...] = ()
     """(C,) reasons why the keypoints do not confirm a start, "" = they do; empty = not searched."""
+    short: np.ndarray | None = None
+    """(C,) sets by which images seem to be late beyond ``sets``, too few to tell a start from a
+    slip."""
     too_short: bool = False
     """The recording, or its number of frame sets, is too small for a search."""
 

@@ -208,17 +208,34 @@ def test_one_group_of_joints_moves_no_camera():
     assert not starts.sets.any() and starts.undetermined[2]
 
 
+@pytest.mark.parametrize("odd", [0, 3], ids=["the master", "another camera"])
 @pytest.mark.parametrize("late", [0, 6], ids=["in step", "one late"])
-def test_one_camera_of_other_motion_moves_no_other(late):
-    """Camera 3 shows the recording backwards."""
+def test_one_camera_of_other_motion_moves_no_other(late, odd):
+    """One camera shows the recording backwards."""
     people = walk(np.where(np.arange(VIEWS) == 2, late / 15, 0.0), 15.0, 3.0)
-    forth = [row[3] for row in people.images]
+    forth = [row[odd] for row in people.images]
     for row, image in zip(people.images, reversed(forth), strict=True):
-        row[3] = image
+        row[odd] = image
     starts = starts_of(people, 15.0)
-    assert starts.sets[[0, 1, 2, 4, 5]].tolist() == [0, 0, late, 0, 0]
-    assert starts.sets[3] == 0 and starts.undetermined[3]
-    assert not starts.in_doubt[[0, 1, 2, 4, 5]].any()
+    right = np.arange(VIEWS) != odd
+    assert starts.sets[right].tolist() == np.where(np.arange(VIEWS) == 2, late, 0)[right].tolist()
+    assert starts.sets[odd] == 0 and starts.undetermined[odd]
+    assert not starts.in_doubt[right].any()
+
+
+def test_a_late_master_moves_all_others_against_it():
+    starts = starts_of(walk(np.where(np.arange(VIEWS) == 0, 8 / 15, 0.0), 15.0, 3.0), 15.0)
+    assert starts.sets.tolist() == [0, *[-8] * (VIEWS - 1)] and not any(starts.undetermined)
+
+
+def test_a_long_slip_is_not_a_start():
+    """The images of camera 4 are 3 sets late from the ninth set on."""
+    people, late = (walk(np.where(np.arange(VIEWS) == 4, s / 15, 0.0), 15.0, 3.0) for s in (0, 3))
+    for t in range(8, people.num_sets):
+        people.images[t][4] = late.images[t][4]
+    result = moments_of(people, 15.0)
+    assert not result.starts.sets.any()
+    assert result.slip[:, 4].tolist() == [0] * 8 + [3] * 37
 
 
 def test_a_statement_outweighs_most_of_the_joints():
