@@ -22,10 +22,6 @@ from intercap_core.scene.camera_agreement import find_disagreements
 from intercap_core.scene.subject_views import find_subject_views
 from intercap_core.schemas import SCENE
 
-# A kicked tripod
-KICK_DEG, KICK_M = 5.0, 0.15
-
-
 FAULTS = ("none", "moved", "moved during", "poses exchanged", "images exchanged", "other session")
 
 
@@ -38,9 +34,9 @@ class _Altered:
     source: tuple[int, ...]
     """Camera c shows the images of camera ``source[c]``."""
     turned: int = -1
-    """Camera that turns; -1 = none."""
+    """Camera that turns in the second half of the recording; -1 = none."""
     turn: np.ndarray | None = None
-    """(3, 3) its rotation in the second half of the recording, in its own frame."""
+    """(3, 3) its rotation, in its own frame."""
 
     @property
     def num_sets(self) -> int:
@@ -70,14 +66,11 @@ def faulty_cases(
     others = rng.permutation([c for c in range(count) if c != master]).tolist()
     same = tuple(range(count))
     yield "none", frozenset(), detections, rig
-    axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(np.radians(KICK_DEG) * axis / np.linalg.norm(axis)).as_matrix()
-    shift = rng.normal(size=3)
-    kick = rigid(turn, KICK_M * shift / np.linalg.norm(shift))
+    kick = _displaced(rng, 5.0, 0.15)  # a kicked tripod
     poses = rig.master_from_colour.copy()
     poses[others[0]] = poses[others[0]] @ kick
     yield "moved", frozenset(others[:1]), detections, rig.moved(poses)
-    turned = _Altered(detections, rig, same, others[0], turn)
+    turned = _Altered(detections, rig, same, others[0], kick[:3, :3])
     yield "moved during", frozenset(others[:1]), turned, rig
     if count >= 3:
         a, b = others[:2]
@@ -89,15 +82,16 @@ def faulty_cases(
         yield "images exchanged", frozenset((a, b)), _Altered(detections, rig, tuple(order)), rig
     if count >= 4:
         poses = rig.master_from_colour.copy()
-        for c in others:  # a rig that was set up again, within half a metre and 15 degrees
-            away = Rotation.from_rotvec(np.radians(15) * _unit(rng)).as_matrix()
-            poses[c] = poses[c] @ rigid(away, 0.5 * _unit(rng))
+        for c in others:  # a rig that was set up again
+            poses[c] = poses[c] @ _displaced(rng, 15.0, 0.5)
         yield "other session", frozenset(others), detections, rig.moved(poses)
 
 
-def _unit(rng: np.random.Generator) -> np.ndarray:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)
+def _displaced(rng: np.random.Generator, degrees: float, metres: float) -> np.ndarray:
+    """Displacement (4, 4) of a camera by these amounts, in random directions."""
+    axis, shift = rng.normal(size=(2, 3))
+    turn = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    return rigid(turn, metres * shift / np.linalg.norm(shift))
 
 
 @dataclass(frozen=True)

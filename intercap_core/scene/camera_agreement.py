@@ -33,8 +33,6 @@ from intercap_core.scene.subject_views import MAX_ERROR_PX, SubjectViews
 
 NOT_AGREEING = "does not agree with the other cameras"  # begins the note of a named camera
 UNDETERMINED = "cause not determined"
-AGREES = 0.8  # share of inliers of a hypothesis that holds; correct cameras of the studio: 0.9
-CONTRADICTS = 0.5  # share of inliers below which a camera is named: most detections are outliers
 
 
 @dataclass(frozen=True)
@@ -58,35 +56,6 @@ class Disagreement:
         return f"{NOT_AGREEING} (keypoints {size}{usual}): {self.cause}"
 
 
-@dataclass(frozen=True, eq=False)
-class _Views:
-    """Keypoints (S, C, 135, 3) of one person in S frame sets, body only."""
-
-    keypoints: np.ndarray
-    """(S, C, 135, 3) x, y, confidence; 0 = not seen."""
-
-    def triangulate(self, rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inliers (S, K, C), detections (S, K, C) and points (S, K, 3) with poses of ``rig``.
-
-        Sides are made consistent first.
-        """
-        keypoints, found = triangulate_people(
-            self.keypoints, rig, min_confidence=MIN_CONFIDENCE, max_error_px=MAX_ERROR_PX
-        )
-        sets, views = keypoints.shape[:2]
-        shape = (sets, NUM_KEYPOINTS, views)
-        seen = np.swapaxes(keypoints[..., 2] >= MIN_CONFIDENCE, 1, 2)
-        inlier = found.inlier.reshape(shape) & seen
-        points = found.points.reshape(sets, NUM_KEYPOINTS, 3)
-        return inlier[:, BODY_POINTS], seen[:, BODY_POINTS], points[:, BODY_POINTS]
-
-    def shares(self, rig: Rig) -> np.ndarray:
-        """Share (S, C) of the detections that are inliers; NaN = nothing seen."""
-        inlier, seen, _ = self.triangulate(rig)
-        count = seen.sum(1)
-        return np.where(count > 0, inlier.sum(1) / np.maximum(count, 1), np.nan)
-
-
 def find_disagreements(
     people: PeopleOfImages, subject: SubjectViews, image_of: np.ndarray, rig: Rig
 ) -> list[Disagreement]:
@@ -97,48 +66,38 @@ def find_disagreements(
         subject: the subject's keypoints by moment.
         image_of: (T, C) set whose image of each camera shows each moment; -1 = none.
     """
-    views = _sampled(people, subject, image_of)
-    if len(rig) < 2 or not len(views.keypoints):
+    keypoints = _sample(people, subject, image_of)
+    if len(rig) < 2 or not len(keypoints):
         return []
-    by_set = views.shares(rig)
-    share = _mean(by_set)
-    moved_at = {c: _changes(by_set[:, c]) for c in range(len(rig))}
-    bad = [c for c in range(len(rig)) if share[c] < CONTRADICTS or moved_at[c] is not None]
+    shares = _inlier_shares(keypoints, rig)
+    agrees = _agree(shares)
+    parts = [_contradicting_part(own) for own in shares.T]
+    bad = [c for c, part in enumerate(parts) if part is not None or not agrees[c]]
     if not bad:
         return []
-    agreeing = [c for c in range(len(rig)) if share[c] >= CONTRADICTS and c not in bad]
     causes = dict.fromkeys(bad, UNDETERMINED)
-    exchanged = _exchanged(views, rig, bad)
-    if exchanged is not None:
-        bad = list(exchanged)
-        agreeing = [c for c in range(len(rig)) if c not in bad]
+    if exchanged := _exchanged(keypoints, rig, bad):
         first, second = (rig.names[c] for c in exchanged)
-        causes = dict.fromkeys(
-            bad, f"poses, or images, of {first} and {second} are exchanged in the input"
-        )
-    elif len(agreeing) < max(3, len(rig) / 2):
-        # no majority tells which cameras are wrong
-        bad = [c for c in range(len(rig)) if np.isfinite(by_set[:, c]).any()]
+        words = f"poses, or images, of {first} and {second} are exchanged in the input"
+        causes, parts = dict.fromkeys(exchanged, words), [None] * len(rig)
+    elif len(rig) - len(bad) < max(3, len(rig) / 2):  # no majority tells which cameras are wrong
         words = "too few cameras agree to tell which: the calibration may be of another session"
-        causes = dict.fromkeys(bad, words if len(rig) > 2 else UNDETERMINED)
+        seen = np.flatnonzero(np.isfinite(shares).any(0)).tolist()
+        causes = dict.fromkeys(seen, words if len(rig) > 2 else UNDETERMINED)
     else:
-        for c in bad:
-            part = moved_at[c]
-            words = _displacement(views, rig, c, part)
-            if words:
-                causes[c] = words
-    error = _errors(views, rig, agreeing)
-    for c in bad:
-        if (part := moved_at[c]) is not None and exchanged is None:
-            error[c] = _errors(_Views(views.keypoints[part]), rig, agreeing)[c]
-    usual = float(np.median(error[agreeing])) if agreeing else np.inf
-    return [
-        Disagreement(c, causes[c], float(error[c]), usual, _metres(rig, c, error[c]))
-        for c in bad
-        # A part of the recording may show someone else: a cause must explain it.
-        if (share[c] < CONTRADICTS or causes[c] != UNDETERMINED)
-        and error[c] > MAX_ERROR_PX  # half of its detections are outliers against the others
-    ]
+        causes = {c: _displacement(keypoints, rig, c, parts[c]) for c in bad}
+    agreeing = [c for c in range(len(rig)) if c not in (exchanged or bad)]
+    errors = _errors(keypoints, rig, agreeing)
+    usual = float(np.median(errors[agreeing])) if agreeing else np.inf
+    found = []
+    for c, cause in causes.items():
+        part = parts[c]
+        error = errors[c] if part is None else _errors(keypoints[part], rig, agreeing)[c]
+        # a part of the recording may show someone else: a cause must explain it
+        is_explained = not agrees[c] or cause != UNDETERMINED
+        if is_explained and error > MAX_ERROR_PX:  # most detections are outliers to the others
+            found.append(Disagreement(c, cause, float(error), usual, _metres(rig, c, error)))
+    return found
 
 
 def widened(covariance: np.ndarray, rig: Rig, found: list[Disagreement]) -> np.ndarray:
@@ -160,74 +119,92 @@ def widened(covariance: np.ndarray, rig: Rig, found: list[Disagreement]) -> np.n
     return result
 
 
-def _sampled(people: PeopleOfImages, subject: SubjectViews, image_of: np.ndarray) -> _Views:
-    """Body keypoints of up to 40 moments.
+def _sample(people: PeopleOfImages, subject: SubjectViews, image_of: np.ndarray) -> np.ndarray:
+    """Body keypoints (S, C, 135, 3) of up to 40 moments; 0 = not seen.
 
     An image in which the subject was not found shows it if it shows only one person.
     """
-    seen = (image_of >= 0).sum(1) >= 2
-    rows = np.array(sample_evenly(seen, 40), int)
-    keypoints = np.zeros((len(rows), *subject.keypoints.shape[1:]))
-    for row, t in enumerate(rows.tolist()):
+    moments = sample_evenly((image_of >= 0).sum(1) >= 2, 40)
+    result = np.zeros((len(moments), *subject.keypoints.shape[1:]))
+    for row, t in enumerate(moments):
         for c in np.flatnonzero(image_of[t] >= 0).tolist():
             own = subject.keypoints[t, c]
             everyone = people.people(int(image_of[t, c]), c)
             if not own[BODY_POINTS, 2].any() and len(everyone) == 1:
                 own = everyone[0]
-            keypoints[row, c, BODY_POINTS] = own[BODY_POINTS]
-    return _Views(keypoints)
+            result[row, c, BODY_POINTS] = own[BODY_POINTS]
+    return result
 
 
-def _mean(shares: np.ndarray) -> np.ndarray:
-    """Mean (C,) over the sets; 1 for cameras that see the person in fewer than 5 sets."""
+def _triangulate(keypoints: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inliers (S, K, C), detections (S, K, C) and body points (S, K, 3) of (S, C, 135, 3)."""
+    keypoints, found = triangulate_people(
+        keypoints, rig, min_confidence=MIN_CONFIDENCE, max_error_px=MAX_ERROR_PX
+    )
+    sets, views = keypoints.shape[:2]
+    seen = np.swapaxes(keypoints[..., 2] >= MIN_CONFIDENCE, 1, 2)
+    inlier = found.inlier.reshape(sets, NUM_KEYPOINTS, views) & seen
+    points = found.points.reshape(sets, NUM_KEYPOINTS, 3)
+    return inlier[:, BODY_POINTS], seen[:, BODY_POINTS], points[:, BODY_POINTS]
+
+
+def _inlier_shares(keypoints: np.ndarray, rig: Rig) -> np.ndarray:
+    """Share (S, C) of the detections that are inliers; NaN = nothing seen."""
+    inlier, seen, _ = _triangulate(keypoints, rig)
+    count = seen.sum(1)
+    return np.where(count > 0, inlier.sum(1) / np.maximum(count, 1), np.nan)
+
+
+def _agree(shares: np.ndarray) -> np.ndarray:
+    """Mask (C,) of the cameras most of whose detections are inliers, by ``shares`` (S, C).
+
+    Cameras that see the person in fewer than five sets agree.
+    """
     seen = np.isfinite(shares).sum(0)
-    return np.where(seen < 5, 1.0, np.nansum(shares, 0) / np.maximum(seen, 1))
+    return (seen < 5) | (np.nansum(shares, 0) >= 0.5 * seen)
 
 
-def _changes(share: np.ndarray) -> slice | None:
+def _contradicting_part(share: np.ndarray) -> slice | None:
     """Part of the sets in which a camera contradicts the others, if it agrees in the rest.
 
-    Each part has five sets with the person or more.
+    Each part has five sets with the person or more. ``share``: (S,) of inliers.
     """
     rows = np.flatnonzero(np.isfinite(share))
     own = share[rows]
-    if len(own) < 10:
+    splits = range(5, len(own) - 4)
+    if not splits:
         return None
-    middle = range(5, len(own) - 4)
-    apart = [abs(own[:k].mean() - own[k:].mean()) for k in middle]
-    k = middle[int(np.argmax(apart))]
-    before, after = own[:k].mean(), own[k:].mean()
-    if min(before, after) >= CONTRADICTS or max(before, after) < AGREES:
+    k = max(splits, key=lambda k: abs(own[:k].mean() - own[k:].mean()))
+    before, after = own[:k].mean() >= 0.5, own[k:].mean() >= 0.5
+    if before == after:
         return None
-    return slice(0, int(rows[k])) if before < after else slice(int(rows[k]), len(share))
+    return slice(int(rows[k]), len(share)) if before else slice(0, int(rows[k]))
 
 
-def _exchanged(views: _Views, rig: Rig, bad: list[int]) -> tuple[int, int] | None:
+def _exchanged(keypoints: np.ndarray, rig: Rig, bad: list[int]) -> tuple[int, int] | None:
     """The two cameras that agree with each other's pose; all cameras must agree then."""
-    best: tuple[float, tuple[int, int] | None] = (AGREES, None)
+    best: tuple[float, tuple[int, int] | None] = (0.0, None)
     for a, b in combinations(range(len(rig)), 2):
         if a in bad or b in bad:
             poses = rig.master_from_colour.copy()
             poses[[a, b]] = poses[[b, a]]
-            worst = float(_mean(views.shares(rig.moved(poses))).min())
-            if worst >= best[0]:
-                best = worst, (a, b)
+            shares = _inlier_shares(keypoints, rig.moved(poses))
+            if _agree(shares).all() and (mean := float(np.nanmean(shares))) > best[0]:
+                best = mean, (a, b)
     return best[1]
 
 
-def _displacement(views: _Views, rig: Rig, camera: int, part: slice | None) -> str:
-    """Displacement of a moved camera in words; "" if no other pose explains its keypoints."""
-    keypoints = views.keypoints[part or slice(None)]
+def _displacement(keypoints: np.ndarray, rig: Rig, camera: int, part: slice | None) -> str:
+    """Displacement of a moved camera in words; UNDETERMINED if no pose explains its keypoints."""
+    keypoints = keypoints[part or slice(None)]
     without = keypoints.copy()
     without[:, camera] = 0
-    _, _, points = _Views(without).triangulate(rig)
+    _, _, points = _triangulate(without, rig)
     lens, own = rig[camera].colour, keypoints[:, camera, BODY_POINTS]
-    known = np.isfinite(points[..., 0]) & (own[..., 2] >= MIN_CONFIDENCE)
-    even = np.zeros(known.shape, bool)
-    even[::2] = True
-    fit = known & even
+    fit = np.isfinite(points[..., 0]) & (own[..., 2] >= MIN_CONFIDENCE)
+    fit[1::2] = False
     if fit.sum() < 12:  # twice the six points of a resection
-        return ""
+        return UNDETERMINED
     rays = lens.unproject(own[..., :2])
     limit = MAX_ERROR_PX * pixel_scale(rig)[camera]
     done, turn, shift, _ = cv2.solvePnPRansac(
@@ -235,37 +212,34 @@ def _displacement(views: _Views, rig: Rig, camera: int, part: slice | None) -> s
         iterationsCount=300, reprojectionError=limit / lens.fx, flags=cv2.SOLVEPNP_EPNP,
     )  # fmt: skip
     if not done:
-        return ""
+        return UNDETERMINED
     pose = invert(rigid(cv2.Rodrigues(turn)[0], shift.ravel()))
     poses = rig.master_from_colour.copy()
-    away = poses[camera, :3, :3].T @ pose[:3, :3]
-    degrees = np.degrees(Rotation.from_matrix(away).magnitude())
+    degrees = np.degrees(Rotation.from_matrix(poses[camera, :3, :3].T @ pose[:3, :3]).magnitude())
     metres = float(np.linalg.norm(pose[:3, 3] - poses[camera, :3, 3]))
     if metres > float(np.linalg.norm(ring_centre(rig) - poses[camera, :3, 3])):
-        return ""  # beyond the person: these are the keypoints of someone else
+        return UNDETERMINED  # beyond the person: these are the keypoints of someone else
     poses[camera] = pose
-    check = _Views(keypoints[1::2])
-    if _mean(check.shares(rig.moved(poses)))[camera] < AGREES:
-        return ""
+    if not _agree(_inlier_shares(keypoints[1::2], rig.moved(poses)))[camera]:
+        return UNDETERMINED
     when = "" if part is None else " during the recording"
     return f"the camera was moved{when} by about {degrees:.0f} degrees and {100 * metres:.0f} cm"
 
 
-def _errors(views: _Views, rig: Rig, agreeing: list[int]) -> np.ndarray:
+def _errors(keypoints: np.ndarray, rig: Rig, agreeing: list[int]) -> np.ndarray:
     """Median error (C,) of the detections of each camera, pixels of a 1080p image.
 
     Points are triangulated from the cameras that agree; infinite without such points.
     """
-    without = np.zeros_like(views.keypoints)
-    without[:, agreeing] = views.keypoints[:, agreeing]
-    _, _, points = _Views(without).triangulate(rig)
-    count = len(rig)
-    pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
-    own = np.swapaxes(views.keypoints[:, :, BODY_POINTS], 1, 2).reshape(-1, count, 3)
-    known = np.isfinite(points.reshape(-1, 3)[:, :1]) & (own[..., 2] >= MIN_CONFIDENCE)
+    others = np.zeros_like(keypoints)
+    others[:, agreeing] = keypoints[:, agreeing]
+    points = _triangulate(others, rig)[2].reshape(-1, 3)
+    pixels = reproject(np.nan_to_num(points, nan=1.0), rig)
+    own = np.swapaxes(keypoints[:, :, BODY_POINTS], 1, 2).reshape(*pixels.shape[:2], 3)
+    known = np.isfinite(points[:, :1]) & (own[..., 2] >= MIN_CONFIDENCE)
     size = np.linalg.norm(pixels - own[..., :2], axis=2) / pixel_scale(rig)
     return np.array(
-        [np.median(size[known[:, c], c]) if known[:, c].any() else np.inf for c in range(count)]
+        [np.median(e[k]) if k.any() else np.inf for e, k in zip(size.T, known.T, strict=True)]
     )
 
 
