@@ -15,7 +15,6 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.fit import (
     CONTOUR_SCALES_PX,
     DEPTH_SCALES_M,
-    REPORT_CONTOUR_PX,
     view_fits,
 )
 from intercap_core.object_track.view import FitContext, View
@@ -26,9 +25,9 @@ from intercap_core.object_track.view_report import ViewReport
 # all views have in common (calibration, masks that are too large) shift the object rather than
 # rotate it.
 COMMON_ERROR_VARIANCE = 4.0  # of shifts; tuned
-COMMON_TURN_VARIANCE = 1.5  # of turns; tuned
-TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
-"""(6,) corrects standard deviations (turn, shift) computed with ``COMMON_ERROR_VARIANCE`` alone."""
+# (6,) corrects standard deviations (turn, shift) computed with COMMON_ERROR_VARIANCE alone. That of
+# turns is 1.5; tuned.
+TURN_SCALE = np.repeat([np.sqrt(1.5 / COMMON_ERROR_VARIANCE), 1.0], 3)
 # Duration of errors of masks, seconds: frames within it are one independent observation.
 ERROR_LASTING_S = 0.3  # tuned
 # Standard deviations (turn, shift) of an unobserved pose: a uniform angle, radians; a room, metres.
@@ -72,7 +71,7 @@ def evidence_at(
         fit.choose()
         depth = fit.depth_terms(DEPTH_SCALES_M[1])
         contour = fit.contour_terms(CONTOUR_SCALES_PX[1], context.background_term)[:2]
-        return depth, contour, fit.report(REPORT_CONTOUR_PX)
+        return depth, contour, fit.report()
 
     by_view = context.renderer.pool.map(terms, fits)
     depth = [np.array(part) for part in zip(*(terms[0] for terms in by_view), strict=True)]
@@ -87,7 +86,7 @@ def report_at(
     """Return the report of :func:`evidence_at` for one view and ``pose`` (4, 4)."""
     (fit,) = view_fits(context, [view], pose, twist)
     fit.choose()
-    return fit.report(REPORT_CONTOUR_PX)
+    return fit.report()
 
 
 def views_noise(evidences: Sequence[ImageEvidence]) -> float:

@@ -21,7 +21,6 @@ from intercap_core.object_track.view_report import ViewReport, quick_report
 # the noise.
 DEPTH_SCALES_M = (0.050, 0.012)  # metres; tuned
 CONTOUR_SCALES_PX = (30.0, 6.0)  # pixels at full resolution; tuned
-REPORT_CONTOUR_PX = 4.0 * CONTOUR_SCALES_PX[1]  # scale of the residuals in a report, pixels
 FIT_ROUNDS = (4, 5)  # at most this many Gauss-Newton steps after each choice of candidates; tuned
 
 
@@ -140,7 +139,7 @@ def fit_pose(
                 seen = seen_by(drawn_pose, views, twist)
                 for fit, own, drawn in zip(fits, seen, _draw(context, views, seen), strict=True):
                     fit.see(own, drawn)
-    reports = pool.map(lambda fit: fit.report(REPORT_CONTOUR_PX), fits)
+    reports = pool.map(lambda fit: fit.report(), fits)
     covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
     return FittedPose(pose, covariance, tuple(reports), np.zeros(6) if twist is None else twist)
 

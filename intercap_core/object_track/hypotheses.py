@@ -39,10 +39,6 @@ RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not follow
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
 # Poses within this distance of an annotated pose may show the annotated object.
 ANNOTATED_REACH_M = 0.2  # metres; tuned
-# Evidence that an annotated pose adds in its frame: for this pose, and for all poses within
-# ANNOTATED_REACH_M. The latter outweighs a jump there and back for that frame alone.
-ANNOTATION_LOG_RATIO = 10.0  # nats; tuned
-ANNOTATED_LOG_RATIO = 3 * JUMP_COST
 
 
 class Prior:
@@ -94,8 +90,9 @@ class Prior:
             poses = np.array([fit.pose for fit in fits])
             _, shift = pose_distances(mesh, self.given[t].pose[None], poses)
             squared = self.given[t].squared_distances(mesh, poses)
-            near = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
-            result += (ANNOTATED_LOG_RATIO * (shift[0] < ANNOTATED_REACH_M) + near) / share
+            near = np.maximum(JUMP_COST - 0.5 * squared, 0.0)
+            # all poses nearby outweigh a jump there and back for this frame alone
+            result += (3 * JUMP_COST * (shift[0] < ANNOTATED_REACH_M) + near) / share
         return result
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import rotation_exp, step_between
 from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 
-MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
 # Longest rest of the partition, half a minute at 30 Hz. It limits the run time, which grows with
 # the square of a rest's length; a minute at rest takes 1.5 times as long without it.
 MAX_REST_FRAMES = 900
-# Costs are minus log-likelihoods, nats.
+# Costs are minus log-likelihoods, nats; tuned on the studio.
 MOVING_COST = 9.0  # of each independent observation in motion, for the six numbers of a pose; tuned
 REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
 
@@ -47,7 +46,7 @@ def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -
     seen = np.trace(information, axis1=1, axis2=2) > 0
     step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
     share = min(1.0, step / ERROR_LASTING_S)
-    shortest = max(3, round(MIN_REST_S / step))
+    shortest = max(3, int(1 / share))  # frames: one independent observation
     variance = 1.0
     segments = np.full(count, -1)
     for _ in range(2):

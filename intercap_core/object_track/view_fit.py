@@ -174,13 +174,14 @@ class ViewFit:
         weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
         return weight * hessian, weight * gradient, residuals
 
-    def report(self, contour_scale_px: float) -> ViewReport:
-        """Compare the current renderings with the view; the scale is at full resolution."""
+    def report(self) -> ViewReport:
+        """Compare the current renderings with the view."""
         view, image = self._view, self._silhouette
         overlap = contour = float("nan")
         if self._candidate is not None:
             overlap = mask_overlap(image, self._candidate.mask, view.person)
-            _, _, residuals = self.contour_terms(contour_scale_px, True)
+            # px at full resolution: four times the last scale of a fit, so that outliers count
+            _, _, residuals = self.contour_terms(24.0, True)
             contour = float(np.median(residuals)) * view.geometry.step if len(residuals) else 0.0
         visible = visible_pixels(image, view.person)
         depth_residual = agreement = float("nan")

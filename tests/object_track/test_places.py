@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.object_track.decoder import JUMP_COST
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import (
-    ANNOTATED_LOG_RATIO,
-    ANNOTATION_LOG_RATIO,
     UPRIGHT_LOG_RATIO,
     Prior,
     group_by_candidates,
@@ -158,9 +157,9 @@ def test_upright_and_annotated_poses_weigh_more(cup):
     assert plain[0] - plain[1] == pytest.approx(2 * UPRIGHT_LOG_RATIO)
     prior.given[3] = GivenPose(3, hangs.pose, 0.01, FIVE_DEGREES)
     annotated = prior.weigh(3, [stands, hangs])
-    most = ANNOTATED_LOG_RATIO + ANNOTATION_LOG_RATIO
+    most = 4 * JUMP_COST
     assert annotated[1] - plain[1] == pytest.approx(most / SHARE)
-    assert annotated[0] - plain[0] <= ANNOTATED_LOG_RATIO / SHARE  # turned over: within reach only
+    assert annotated[0] - plain[0] <= 3 * JUMP_COST / SHARE  # turned over: within reach only
     np.testing.assert_allclose(prior.weigh(4, [stands, hangs]), plain)
 
 
