@@ -54,6 +54,18 @@ KEYPOINT_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)  # order of OpenPose
 FACE, CONTOUR = slice(67, 118), slice(118, 135)  # order of SMPL-X's landmarks
 
+
+def _partner(name: str) -> str:
+    for side, other in (("left_", "right_"), ("right_", "left_")):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name
+
+
+# (135,) index of the same keypoint of the other side. A keypoint without sides is its own partner,
+# and so are those of the face, which detectors recognise as a whole.
+PARTNER = np.array([KEYPOINT_INDEX[_partner(name)] for name in KEYPOINT_INDEX])
+
 # Bones between body keypoints by name: of an arm, leg and foot of one side; of both sides at once.
 ARM_BONES = (("shoulder", "elbow"), ("elbow", "wrist"))
 LEG_BONES = (("hip", "knee"), ("knee", "ankle"))

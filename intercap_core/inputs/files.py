@@ -28,10 +28,6 @@ _FILE_TYPES = {
     stat.S_ISFIFO: "a pipe",
     stat.S_ISSOCK: "a socket",
 }
-_REPR = reprlib.Repr()
-_REPR.maxlevel = 3
-_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 6
-_REPR.maxstring = _REPR.maxother = 80
 
 
 class UnreadableFile(UserError):
@@ -121,7 +117,9 @@ def quoted(value: Any, most: int = 80) -> str:
     if isinstance(value, dict):
         keys = ", ".join(printable(str(key)[:40]) for key in list(value)[:5])
         return f"an object with {keys}" if keys else "an empty object"
-    text = printable(_REPR.repr(value))
+    short = reprlib.Repr()  # shows six entries of a list, without reading the others
+    short.maxlevel, short.maxstring, short.maxother = 3, 80, 80
+    text = printable(short.repr(value))
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

@@ -19,6 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
+from intercap_core.body.keypoints import PARTNER
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import (
     midpoints,
@@ -26,7 +27,7 @@ from intercap_core.geometry.camera.triangulation import (
     reproject,
     view_pairs,
 )
-from intercap_core.person.sides import BODY_POINTS, PARTNER
+from intercap_core.person.sides import BODY_POINTS
 
 # Body points that two detections must share. Tuned on the studio: the subject is the same with 1 to
 # 15, the number of other people is not.

@@ -25,7 +25,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_INDEX
+from intercap_core.body.keypoints import KEYPOINT_INDEX, PARTNER
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import midpoints, rays_of
 from intercap_core.geometry.solve.time_series import cheapest_sequence
@@ -34,7 +34,6 @@ from intercap_core.person.sides import (
     HEAD,
     LEGS,
     LIMBS,
-    PARTNER,
     exchange_limb,
     exchange_points,
 )

@@ -38,9 +38,15 @@ INSET_M = {
     "knee": 0.059,
     "ankle": 0.040,
 }
-_PARTS = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
-INSETS_M = np.array([INSET_M.get(part, 0.0) for part in _PARTS])  # (135,) metres
-INSETS_M[LEFT_HAND] = INSETS_M[RIGHT_HAND] = 0.008  # half a finger (anatomy)
+
+
+def _inset(index: int, name: str) -> float:
+    if index in range(LEFT_HAND.start, RIGHT_HAND.stop):
+        return 0.008  # half a finger (anatomy)
+    return INSET_M.get(name.removeprefix("left_").removeprefix("right_"), 0.0)
+
+
+INSETS_M = np.array([_inset(i, name) for i, name in enumerate(KEYPOINT_NAMES)])  # (135,)
 
 
 @dataclass(frozen=True, eq=False)

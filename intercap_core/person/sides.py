@@ -12,21 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.annotation import ExchangedSides
-from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX, LEFT_HAND, RIGHT_HAND
+from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX, LEFT_HAND, PARTNER, RIGHT_HAND
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.triangulation import Triangulation
-
-
-def _partner(name: str) -> str:
-    for side, other in (("left_", "right_"), ("right_", "left_")):
-        if name.startswith(side):
-            return other + name.removeprefix(side)
-    return name
-
-
-# (135,) index of the same keypoint of the other side. A keypoint without sides is its own partner,
-# and so are those of the face, which detectors recognise as a whole.
-PARTNER = np.array([KEYPOINT_INDEX[_partner(name)] for name in KEYPOINT_INDEX])
 
 
 def _both_sides(*names: str) -> np.ndarray:

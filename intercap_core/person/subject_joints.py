@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_INDEX
+from intercap_core.body.keypoints import KEYPOINT_INDEX, PARTNER
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import (
     Triangulation,
@@ -23,7 +23,7 @@ from intercap_core.geometry.camera.triangulation import (
 )
 from intercap_core.geometry.solve.time_series import cheapest_sequence, limited_velocity
 from intercap_core.person.left_right import find_mirrored, make_views_agree
-from intercap_core.person.sides import LIMBS, PARTNER, exchange_everywhere, exchange_limb
+from intercap_core.person.sides import LIMBS, exchange_everywhere, exchange_limb
 
 # Largest angular speed of a keypoint, rad/s: hands reach 5 m/s in everyday tasks, at two metres
 # from the cameras of a ring. Faster jumps in an image are wrong detections. Between two known

@@ -20,16 +20,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.body.keypoints import (
+    BODY,
+    CONTOUR,
+    FACE,
+    KEYPOINT_NAMES,
+    LEFT_HAND,
+    PARTNER,
+    RIGHT_HAND,
+)
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.studio.noise import NoiseSource
 
-OTHER_SIDE = np.arange(135)  # index of the same point on the other side; the face stays
-for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
-    if _name.startswith("left_"):
-        _j = KEYPOINT_NAMES.index("right_" + _name[5:])
-        OTHER_SIDE[_i], OTHER_SIDE[_j] = _j, _i
-OTHER_SIDE[LEFT_HAND], OTHER_SIDE[RIGHT_HAND] = np.arange(46, 67), np.arange(25, 46)
 _LEG_WORDS = ("_hip", "knee", "ankle", "toe", "heel")
 _LEGS = np.array(
     [i for i, n in enumerate(KEYPOINT_NAMES[:25]) if any(w in n for w in _LEG_WORDS) and i != 8]
@@ -176,7 +178,7 @@ class Detector:
         pixels, confidence = pixels.copy(), confidence.copy()
         for t in np.flatnonzero(swapped.any(1)):
             rows = np.arange(67) if swapped[t, 0] else _LEGS
-            source = OTHER_SIDE[rows]
+            source = PARTNER[rows]
             pixels[t, rows], confidence[t, rows] = pixels[t, source], confidence[t, source]
             confidence[t, rows] *= 0.92
         return pixels, confidence

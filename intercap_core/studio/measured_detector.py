@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, ndtr
 
-from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES, LEFT_HAND, PARTNER, RIGHT_HAND
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.studio.keypoints import OTHER_SIDE, Detector
+from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
 
 HANDS = (LEFT_HAND, RIGHT_HAND)
@@ -120,8 +120,8 @@ class MeasuredDetector(Detector):
     def build(cls, noise: NoiseSource, frames: int, body_bias: float = 1.0) -> MeasuredDetector:
         """Draw the offsets, mirrored from left to right; ``body_bias`` scales those of the body."""
         direction = noise.detector_rng("keypoint bias").normal(size=(135, 3))
-        mirrored = direction[OTHER_SIDE] * (-1, 1, 1)  # x points to the person's left
-        is_second = np.arange(135) > OTHER_SIDE
+        mirrored = direction[PARTNER] * (-1, 1, 1)  # x points to the person's left
+        is_second = np.arange(135) > PARTNER
         direction = np.where(is_second[:, None], mirrored, direction)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         size = 1e-3 * _column("bias")

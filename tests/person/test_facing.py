@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from intercap_core.body.keypoints import PARTNER
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.left_right import find_mirrored, make_views_agree
-from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swap_sides
+from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, swap_sides
 from intercap_core.person.subject_joints import triangulate_people
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, stick_person, walking

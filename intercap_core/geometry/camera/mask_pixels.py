@@ -20,8 +20,7 @@ from intercap_core.geometry.camera.transforms import apply
 
 Window = tuple[slice, slice]
 
-_MIN_DEPTH, _MILLIMETRE = np.float32(MIN_DEPTH_M), np.float32(1e-3)
-_ONE, _HALF = np.float32(1), np.float32(0.5)
+_HALF = np.float32(0.5)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
@@ -217,14 +216,15 @@ def _project(near, counts, rays, pose, lens, u, v, z):
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     i, j, k, m = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    one, millimetre, least = np.float32(1), np.float32(1e-3), np.float32(MIN_DEPTH_M)
     for at in range(len(near)):
-        pz = np.float32(near[at]) * _MILLIMETRE
+        pz = np.float32(near[at]) * millimetre
         px, py = rays[at, 0] * pz, rays[at, 1] * pz
         x, y = a * px + b * py + c * pz + d, e * px + f * py + g * pz + h
         depth = i * px + j * py + k * pz + m
         reach = limit * depth
-        inside = counts[at] & (depth > _MIN_DEPTH) & (x * x + y * y <= reach * reach)
-        inverse = _ONE / max(depth, _MIN_DEPTH)
+        inside = counts[at] & (depth > least) & (x * x + y * y <= reach * reach)
+        inverse = one / max(depth, least)
         x, y = x * inverse, y * inverse
         xd, yd = distort(x, y, distortion)
         u[at], v[at] = fx * xd + cx, fy * yd + cy

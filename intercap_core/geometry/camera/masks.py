@@ -15,9 +15,6 @@ import numba
 import numpy as np
 from pycocotools import mask as coco_mask
 
-# Results of :func:`_run_ends`: valid; or unknown character, number cut at the end, number too long,
-# negative run.
-_FINE, _STRANGE, _CUT, _LONG, _NEGATIVE = range(5)
 _ZERO = 48  # "0", the first character of COCO's alphabet
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
 
@@ -156,21 +153,24 @@ def _parse(rle: bytes) -> np.ndarray:
     """Return the ends (n,) int64 of the runs of a compressed RLE."""
     if not rle:
         raise ValueError("its RLE is empty")
-    ends, problem = _run_ends(np.frombuffer(rle, np.uint8))
-    if problem != _FINE:
-        reasons = {
-            _STRANGE: "holds characters that COCO's alphabet does not have",
-            _CUT: "is cut within a number",
-            _LONG: "holds a number that is too long",
-            _NEGATIVE: "holds a run of negative length",
-        }
-        raise ValueError(f"its RLE {reasons[problem]}")
+    characters = np.frombuffer(rle, np.uint8)
+    if characters.min() < _ZERO or characters.max() > _ZERO + 63:
+        raise ValueError("its RLE holds characters that COCO's alphabet does not have")
+    if (characters[-1] - _ZERO) & 0x20:
+        raise ValueError("its RLE is cut within a number")
+    ends, too_long, negative = _run_ends(characters)
+    if too_long:
+        raise ValueError("its RLE holds a number that is too long")
+    if negative:
+        raise ValueError("its RLE holds a run of negative length")
     return ends
 
 
 @numba.njit(cache=True, nogil=True)
 def _run_ends(characters):
-    """Return the ends (n,) int64 of the runs of ``characters`` (m,) uint8, and a fault code.
+    """Return the ends (n,) int64 of the runs of ``characters`` (m,) uint8.
+
+    Also returns whether a number is too long, where reading stops, and whether a run is negative.
 
     A number is written in groups of 5 bits, the lowest first, one character for each group. Bit 5
     of a character means that more groups follow. Bit 4 of the last group is the sign. The first
@@ -178,12 +178,6 @@ def _run_ends(characters):
     the length two runs before.
     """
     ends = np.empty(len(characters), np.int64)
-    first = ends[:0]
-    for character in characters:
-        if character < _ZERO or character > _ZERO + 63:
-            return first, _STRANGE
-    if (characters[-1] - _ZERO) & 0x20:
-        return first, _CUT
     count, digits, value = 0, 0, np.int64(0)
     last, before, end = np.int64(0), np.int64(0), np.int64(0)  # the last number, the one before it
     too_long = negative = False
@@ -206,9 +200,7 @@ def _run_ends(characters):
         ends[count] = end
         before, last = last, value
         count, digits, value = count + 1, 0, np.int64(0)
-    if too_long:
-        return first, _LONG
-    return ends[:count].copy(), _NEGATIVE if negative else _FINE
+    return ends[:count].copy(), too_long, negative
 
 
 @numba.njit(cache=True, nogil=True)
