@@ -68,7 +68,11 @@ class Model(BaseModel):
     """Base of all settings models: no unknown keys, finite numbers, valid paths, immutable."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
+        extra="forbid",
+        frozen=True,
+        use_attribute_docstrings=True,
+        allow_inf_nan=False,
+        coerce_numbers_to_str=True,  # names such as camera 1
     )
 
     @field_validator("*")

@@ -116,41 +116,69 @@ def _bounded_values(content: Any) -> Any:
     return _bounded(str(content)) if type(content) is int else content
 
 
-def _without_base_60(tag: str, pattern: re.Pattern[str]) -> re.Pattern[str]:
-    """Return a YAML scalar's ``pattern`` that does not match numbers with colons."""
-    numbers = (f"{_TAG}int", f"{_TAG}float")
-    return re.compile(f"(?![^:]*:)(?:{pattern.pattern})", re.X) if tag in numbers else pattern
+# Scalars of YAML 1.2 (core schema, section 10.3.2) by their possible first characters. PyYAML
+# reads those of YAML 1.1, in which 0010 is 8, 10:00 is 600 and "no" is false.
+_SCALARS = (
+    ("bool", "true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("merge", "<<", "<"),
+)
+
+
+class WrittenInteger(int):
+    """Integer that keeps its text, such as 01, since it may be a name."""
+
+    text: str
+
+    def __new__(cls, text: str) -> WrittenInteger:
+        """Parse decimal digits."""
+        number = super().__new__(cls, text)
+        number.text = text
+        return number
+
+    def __str__(self) -> str:
+        return self.text
 
 
 class YamlLoader(yaml.SafeLoader):
-    """The safe loader, which refuses repeated keys and reads 10:00:12:13 as text.
+    """The safe loader with the scalars of YAML 1.2. Numbers as keys are text.
 
-    In YAML 1.1 the latter is a number to the base of 60; a user means a time code.
+    Repeated keys are refused.
     """
 
-    yaml_implicit_resolvers = {  # noqa: RUF012 (as the base class has it)
-        first: [(tag, _without_base_60(tag, pattern)) for tag, pattern in resolvers]
-        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (as the base class has it)
 
     def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that a mapping has twice."""
+        """Convert numbers as keys to their text; refuse a key that a mapping has twice."""
         seen = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
-                problem = f"{key.value[:60]!r} is given twice"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            seen.add((key.tag, str(key.value)))
+            if isinstance(key, yaml.ScalarNode):
+                if key.tag in (f"{_TAG}int", f"{_TAG}float"):
+                    key.tag = f"{_TAG}str"
+                if (key.tag, key.value) in seen:
+                    problem = f"{key.value[:60]!r} is given twice"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)  # type: ignore[arg-type]
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int | float:  # type: ignore[override]
         """Return an integer of 64 bits, else infinity."""
-        number = super().construct_yaml_int(node) if len(node.value) <= 80 else None
-        if number is not None and MIN_INTEGER <= number <= MAX_INTEGER:
-            return number
-        return float("-inf" if node.value.startswith("-") else "inf")
+        text = node.value
+        base = 0 if text[:2] in ("0o", "0x") else 10
+        number = int(text, base) if len(text) <= 80 else MAX_INTEGER + 1
+        if not MIN_INTEGER <= number <= MAX_INTEGER:
+            return float("-inf" if text.startswith("-") else "inf")
+        return WrittenInteger(text) if base and str(number) != text else number
 
 
+for _kind, _pattern, _first in _SCALARS:
+    YamlLoader.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"(?:{_pattern})$"), _first)
 YamlLoader.add_constructor(f"{_TAG}int", YamlLoader.construct_yaml_int)
 
 
@@ -160,8 +188,22 @@ def parse_yaml(text: str, loader: type[YamlLoader] = YamlLoader) -> Any:
         return yaml.load(text, Loader=loader)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    except (TypeError, LookupError, AttributeError, OverflowError) as error:
+    except (TypeError, LookupError, AttributeError, ValueError) as error:
         raise ValueError(f"a value does not fit its tag: {error}") from None
+
+
+class _YamlDumper(yaml.SafeDumper):
+    """The safe dumper. Text that YAML 1.1 or 1.2 reads as another type is quoted."""
+
+
+for _kind, _pattern, _first in _SCALARS[1:3]:
+    _YamlDumper.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"(?:{_pattern})$"), _first)
+_YamlDumper.add_representer(WrittenInteger, lambda dumper, value: dumper.represent_int(int(value)))
+
+
+def dump_yaml(content: Any, *, sort_keys: bool = False) -> str:
+    """Serialize plain values as block-style YAML."""
+    return str(yaml.dump(content, Dumper=_YamlDumper, sort_keys=sort_keys))
 
 
 def yaml_fault(error: Exception) -> str:

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-import yaml
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS, TRUTH
 from intercap_core.studio.keypoints import Detector
@@ -295,7 +295,7 @@ def make_capture(
     if capture.states_starts is not None:
         annotation |= erring_starts(stage, capture.states_starts)
     if annotation:
-        text = yaml.safe_dump(annotation, sort_keys=True)
+        text = dump_yaml(annotation, sort_keys=True)
         (output / "annotation.yaml").write_text(text)
     _write_manifest(output, sequence)
 

@@ -16,7 +16,6 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-import yaml
 from pycocotools import mask as coco
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +23,7 @@ from intercap_core.config_types import LayoutName
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.inputs.documents import dump_yaml
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.capture_folder import (
     SOUND_RATE,
@@ -233,7 +233,7 @@ class PlainFolder(CaptureFolder):
                 entry["fps"] = fps // self.capture.every[camera.name]
             cameras[camera.name] = entry
         content = {"master": claimed.names[0], "fps": fps, "cameras": cameras}
-        (self.path / self.calibration).write_text(yaml.safe_dump(content, sort_keys=False))
+        (self.path / self.calibration).write_text(dump_yaml(content))
 
 
 class _PlainFiles(ImageFiles):

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from pydantic import ValidationError
 
 from intercap_core.annotation import ANY_REGION, Annotation
-from intercap_core.inputs.documents import parse_integer
+from intercap_core.inputs.documents import dump_yaml, parse_integer
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, UnreadableFile, read_text
 
 FOLDER = re.compile(
@@ -76,7 +75,7 @@ def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
     if not sections:
         return Converted("", faults)
     head = f"# From {folder.name} of the release. Frames are frame sets, from 0.\n"
-    return Converted(head + yaml.safe_dump(sections, sort_keys=False), faults)
+    return Converted(head + dump_yaml(sections), faults)
 
 
 def _contact(

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.inputs.documents import dump_yaml
 
 COLUMNS = (
     "sequence", "subject", "object", "layout", "recordings", "calibration", "keypoints",
@@ -93,7 +92,7 @@ def _config(draft: Draft, folder: Path) -> str:
     lines = [f"# {remark}" for remark in draft.remarks]
     objects = draft.objects if isinstance(draft.objects, Path) else folder / "objects.yaml"
     settings = {"dataset": draft.dataset, "objects": _relative(objects, folder)}
-    return "\n".join([*lines, yaml.safe_dump(settings, sort_keys=False)])
+    return "\n".join([*lines, dump_yaml(settings)])
 
 
 def _sequences(rows: list[Row], folder: Path) -> str:
@@ -128,7 +127,7 @@ def _objects(entries: dict[str, dict[str, Any]], folder: Path) -> str:
         }
         for name, entry in entries.items()
     }
-    return yaml.safe_dump(written, sort_keys=False)
+    return dump_yaml(written)
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -164,7 +164,7 @@ def test_a_link_and_its_permissions_stay(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "drop_frames: 2020-01-01\n", "floor: [[.nan, 0, 1], [1, 0, 1], [0, 1, 1]]\n",
+        "drop_frames: !!timestamp 2020-01-01\n", "floor: [[.nan, 0, 1], [1, 0, 1], [0, 1, 1]]\n",
         "subject: [{camera: \"\\ud800\", x: 1, y: 2}]\n", "starts: {k1: .inf, k2: 0}\n",
     ],
 )  # fmt: skip

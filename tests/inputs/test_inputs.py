@@ -8,12 +8,21 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from intercap_core.inputs.arrays import read_arrays, read_pickle
-from intercap_core.inputs.documents import parse_json, parse_yaml, read_json, read_toml, read_yaml
+from intercap_core.inputs.documents import (
+    dump_yaml,
+    parse_json,
+    parse_yaml,
+    read_json,
+    read_toml,
+    read_yaml,
+)
 from intercap_core.inputs.files import (
     UnreadableFile,
     check_file,
@@ -118,7 +127,7 @@ def test_integers_beyond_64_bits_become_floats(tmp_path: Path) -> None:
         ("a: !!bool x", "does not fit its tag"),
         ("a: !!timestamp x", "does not fit its tag"),
         ("a: !!int ''", "does not fit its tag"),
-        ("a: 2024-13-45", "month"),
+        ('1: a\n"1": b', "in line 2 .*'1' is given twice"),
         ("b: 0\na: 1\na: 2", "in line 3 .*'a' is given twice"),
         ("a: !!python/object/apply:os.system [ls]", "could not determine a constructor"),
         ("[" * 1500, "nested"),
@@ -138,6 +147,27 @@ def test_yaml_keeps_anchors_and_reads_time_codes_as_text() -> None:
     content = parse_yaml(text)
     assert content["other"] == {"a": 1, "b": 3} and content["list"] == [{"a": 1, "b": 2}] * 2
     assert parse_yaml("12:30:00:10") == "12:30:00:10"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("00010", 10), ("0o10", 8), ("0x1F", 31), ("-07", -7), ("1e3", 1000.0), ("1.", 1.0),
+        (".5", 0.5), ("-.inf", -np.inf), ("yes", "yes"), ("no", "no"), ("on", "on"), ("True", True),
+        ("1_000", "1_000"), ("0b11", "0b11"), ("2024-01-02", "2024-01-02"), ("1:30", "1:30"),
+        ("~", None), ("", None), ("=", "="), ("+", "+"), (".", "."),
+    ],
+)  # fmt: skip
+def test_yaml_scalars_are_those_of_version_1_2(text: str, value: Any) -> None:
+    read = parse_yaml(f"a: {text}\n")["a"]
+    assert read == value and isinstance(read, type(value))
+    assert parse_yaml(dump_yaml({"a": text, "b": read})) == {"a": text, "b": value}
+    assert yaml.safe_load(dump_yaml({"a": text})) == {"a": text}  # also for readers of version 1.1
+
+
+def test_numbers_as_keys_and_names_are_text() -> None:
+    assert parse_yaml("{1: a, 02: b, 0.5: c}") == {"1": "a", "02": "b", "0.5": "c"}
+    assert str(parse_yaml("[02]")[0]) == "02"
 
 
 def _npz(path: Path, content: bytes) -> Path:

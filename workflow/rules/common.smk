@@ -3,8 +3,10 @@ import re
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
+from snakemake.utils import update_config
 
 from intercap_core.errors import UserError
+from intercap_core.inputs.documents import read_yaml
 from intercap_core.pipeline.code_digest import stage_code
 from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.pipeline.stage_inputs import files_read
@@ -22,11 +24,14 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES, Extent
 
 def _load():
     """Load and validate settings and tables before any job starts."""
-    given = workflow.config_settings.configfiles
-    path = given[0] if given else Path("config/config.yaml")
-    overrides = {key: value for key, value in config.items() if key != "project"}
-    config["project"] = {"path": str(path), "overrides": overrides}
+    # Snakemake's own `config` has the scalars of YAML 1.1, in which 010 is 8.
+    given = workflow.config_settings
+    path, *others = given.configfiles or [Path("config/config.yaml")]
+    overrides = {}
     try:
+        for values in (*map(read_yaml, others), given.config):
+            update_config(overrides, values or {})
+        config["project"] = {"path": str(path), "overrides": overrides}
         return load_project(path, overrides)
     except UserError as error:
         raise WorkflowError(str(error)) from None

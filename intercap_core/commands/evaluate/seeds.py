@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from intercap_core.inputs.documents import dump_yaml
 from intercap_core.project import Project, load_project, read_yaml, tidy
 
 TABLES = ("sequences", "subjects")
@@ -58,7 +58,7 @@ def _written(project: Project, seed: int) -> Path:
             writer.writeheader()
             writer.writerows(rows)
     path = folder / f"{project.config.dataset}.yaml"
-    path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    path.write_text(dump_yaml(values), encoding="utf-8")
     return path
 
 

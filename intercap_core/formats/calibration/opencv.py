@@ -80,8 +80,8 @@ def read_opencv_calibration(path: Path) -> Calibration:
             f"{path}: expected 'cameras' with an entry for each camera (or a folder of files, one "
             "a camera); docs/recordings.md shows one"
         )
-    master = content.get("master", next(iter(entries)))
-    if not isinstance(master, str) or master not in entries:
+    master = str(content.get("master", next(iter(entries))))
+    if master not in entries:
         raise UserError(
             f"{path}: master {quoted(master)} is none of the cameras ({list_names(entries)}); "
             "correct the name or add the camera"
@@ -90,14 +90,14 @@ def read_opencv_calibration(path: Path) -> Calibration:
     cameras, poses = {}, {}
     for name, entry in entries.items():
         where = f"{path}: camera {quoted(name)}"
-        if not isinstance(entry, dict) or not CAMERA_NAME.fullmatch(str(name)):
+        if not isinstance(entry, dict) or not CAMERA_NAME.fullmatch(name):
             raise UserError(
                 f"{where}: expected a name of letters, digits, '_' and '-', and fields such as "
                 "camera_matrix; correct it"
             )
-        cameras[str(name)] = _camera(entry, where, fps)
-        poses[str(name)] = _pose(entry, where, path, is_master=name == master)
-    return Calibration(cameras, relate_to_master(path, str(master), poses))
+        cameras[name] = _camera(entry, where, fps)
+        poses[name] = _pose(entry, where, path, is_master=name == master)
+    return Calibration(cameras, relate_to_master(path, master, poses))
 
 
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
