@@ -24,6 +24,7 @@ from intercap_core.evaluation.scene_errors import (
     displacement,
     rig_centre,
 )
+from intercap_core.evaluation.start_windows import WindowErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -63,6 +64,8 @@ class FieldScene:
     """Angle between estimated and true floor normal; NaN without a floor."""
     faults: tuple[NamedFault, ...] = ()
     """Cameras that were named in faulty variants of the recording."""
+    windows: WindowErrors | None = None
+    """Starts in windows of the recording; None = not measured."""
 
     @property
     def worse(self) -> np.ndarray:
@@ -169,8 +172,7 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     """Figures of recordings whose cameras started at different times; milliseconds.
 
     A camera is solved if the error of its delay is below half a frame period. ``offset_wrong``
-    counts the cameras that are neither solved nor reported as undetermined, ``starts_silent_share``
-    is their share.
+    counts the cameras that are neither solved nor reported as undetermined.
     ``offset_normalised`` is 1 if the stated standard deviations are calibrated.
     """
     if not scenes:
@@ -188,7 +190,6 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     found = {
         "offset_solved_share": float(solved.mean()),
         "offset_wrong": float((~solved & ~aside).sum()),
-        "starts_silent_share": float((~solved & ~aside).mean()),
         "offset_cameras": float(len(late)),
     }
     if solved.any():
@@ -199,15 +200,6 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
         found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
         found["offset_normalised"] = float(np.median(late[known] / sigma[known])) / MEDIAN_CHI_1
     return found
-
-
-def in_step_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Share of the cameras that the scene stage moved by half a frame period or more, although they
-    started together."""
-    if not scenes:
-        return {}
-    moved = np.concatenate([np.abs(s.late_s) >= 0.5 / s.fps for s in scenes])
-    return {"in_step_moved_share": float(moved.mean())}
 
 
 def fault_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:

@@ -35,6 +35,12 @@ from intercap_core.commands.evaluate.sequences import areas
 from intercap_core.evaluation.field_errors import stated_displacement
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement
+from intercap_core.evaluation.start_windows import (
+    Recording,
+    WindowErrors,
+    measure_windows,
+    window_figures,
+)
 from intercap_core.evaluation.truth import match_times
 from intercap_core.evaluation.verdict.figures import TRUE, StatedError, stated_errors
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -91,6 +97,8 @@ class DetectorSequence:
     """Slip of each grip, see :func:`grip_slips`."""
     rig: RigErrors
     """Errors of the cameras after ``joint``."""
+    windows: WindowErrors | None
+    """Starts in windows of the recording; None = not measured, with simulated keypoints."""
 
 
 DetectorSequences = Measured[DetectorSequence]
@@ -108,9 +116,12 @@ def measure(project: Project, sequence: str) -> DetectorSequence:
     entry = project.object_of(sequence)
     assert entry is not None  # the recordings of this part have objects
     symmetry = SymmetryGroup.from_settings(entry.symmetry)
+    windows = None
+    if not variant(str(project.config.dataset), "detector"):
+        windows = measure_windows(Recording.read(paths.frames, paths.detections, truth))
     slips = _slips_of(paths.joint, truth, times, metrics.fps, symmetry)
     with artefacts.read(paths.joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
-        return DetectorSequence(metrics, slips, rig_errors(fitted, true))
+        return DetectorSequence(metrics, slips, rig_errors(fitted, true), windows)
 
 
 def rig_errors(
@@ -196,6 +207,7 @@ def figures(recordings: Sequence[DetectorSequence]) -> Figures:
         pooled = TrueAndStated(*(np.concatenate(values) for values in zip(*every, strict=True)))
         quantity, _, unit = name.rpartition("_")
         result[f"{quantity}_true_{unit}"], result[f"{quantity}_stated_{unit}"] = pooled.rms()
+    result |= window_figures([r.windows for r in recordings if r.windows])
     return result | {f"verdict_{key}": value for key, value in found["verdict"].items()}
 
 

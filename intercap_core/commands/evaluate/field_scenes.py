@@ -25,6 +25,7 @@ from intercap_core.commands.evaluate.part import (
 from intercap_core.evaluation import field_errors
 from intercap_core.evaluation.faulty_rigs import name_faults
 from intercap_core.evaluation.field_errors import FieldScene
+from intercap_core.evaluation.start_windows import Recording, measure_windows, window_figures
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
@@ -33,12 +34,18 @@ STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "fiel
 
 
 def measure(project: Project, sequence: str) -> FieldScene:
-    """Errors of one recording after ``scene``; of ``floor`` also faulty variants."""
-    paths = project.paths(sequence)
-    scene = field_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
-    if not str(project.config.dataset).startswith(FLOOR):
-        return scene
-    return replace(scene, faults=tuple(name_faults(paths.frames, paths.detections, paths.scene)))
+    """Errors of one recording after ``scene``; of ``floor`` also faulty variants, of ``beam`` and
+    ``starts`` also starts in windows."""
+    paths, truth = project.paths(sequence), truth_of(project, sequence)
+    scene = field_errors.measure(paths.frames, paths.scene, truth)
+    dataset = str(project.config.dataset)
+    if dataset.startswith(FLOOR):
+        faults = name_faults(paths.frames, paths.detections, paths.scene)
+        return replace(scene, faults=tuple(faults))
+    if dataset.startswith((BEAM, STARTS)):
+        recording = Recording.read(paths.frames, paths.detections, truth)
+        return replace(scene, windows=measure_windows(recording))
+    return scene
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
@@ -47,8 +54,8 @@ def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     found |= keyed("field.", field_errors.start_figures(_of(evaluations, STARTS)))
     found |= keyed("field.rates_", field_errors.start_figures(_of(evaluations, RATES)))
     found |= keyed("field.", field_errors.beam_figures(_of(evaluations, BEAM)))
-    together = _of(evaluations, FLOOR) + _of(evaluations, BEAM)
-    found |= keyed("field.", field_errors.in_step_figures(together))
+    windows = [e.windows for measured in evaluations for e in measured.errors if e.windows]
+    found |= keyed("field.", window_figures(windows))
     found |= keyed("field.", field_errors.fault_figures(_of(evaluations, FLOOR)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
