@@ -15,12 +15,6 @@ from intercap_core.body.keypoints import KEYPOINT_INDEX, LEG_BONES, of_side
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 
-# Largest error of an accelerometer on a tripod, or of a calibration board laid on the floor.
-GRAVITY_CONE_DEG = 10.0
-# Largest error of the cameras' mean up direction: that of cameras on one side of the scene, all of
-# which look down by this angle.
-CAMERA_UP_CONE_DEG = 40.0
-
 # Standard deviations of the evidence for the up direction, degrees. None is tuned.
 # Zero-level offset of the Azure Kinect's accelerometer, 40 mg (data sheet of the LSM6DSM).
 GRAVITY_SENSOR_DEG = 2.3
@@ -29,8 +23,6 @@ CAMERA_ROLL_DEG = 3.0
 # Pitch of a camera, which looks up or down at the person.
 CAMERA_PITCH_DEG = 25.0
 FOOT_M = 0.26  # length of a foot, metres
-# A standing person's centre of mass is above the feet: uniform over a foot, at a height of 1 m.
-BALANCE_DEG = float(np.degrees(FOOT_M / np.sqrt(12)))
 # Height over the floor of the foot keypoints in one place, metres: one to two centimetres.
 FOOT_PLACE_M = 0.02
 # Axis of the calibration's world: a board that is laid on the floor by hand.
@@ -64,13 +56,20 @@ class UpDirection:
 
     direction: np.ndarray
     """(3,) unit."""
-    cone_deg: float
-    """Largest angle to the true direction, degrees."""
     source: str
     """Origin: "gravity", "stated", "cameras", "floor", or several, joined by ", ", of "gravity",
     "cameras", "feet" and "balance"."""
     deviation_deg: float = float("nan")
     """Standard deviation of the angle to the true direction, degrees; NaN = not estimated."""
+
+    @property
+    def cone_deg(self) -> float:
+        """Largest angle of a rough direction to the true one, degrees.
+
+        10 for an accelerometer on a tripod, or a calibration board laid on the floor. 40 for the
+        mean of cameras on one side of the scene, all of which look down by this angle.
+        """
+        return 40.0 if self.source == "cameras" else 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +98,11 @@ def rough_up(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) ->
     if measured.any():
         down = np.einsum("cij,cj->ci", rotations[measured], gravity[measured])
         up = -np.median(down, axis=0)
-        return UpDirection(up / np.linalg.norm(up), GRAVITY_CONE_DEG, "gravity")
+        return UpDirection(up / np.linalg.norm(up), "gravity")
     if stated is not None and np.isfinite(stated).all():
-        return UpDirection(stated, GRAVITY_CONE_DEG, "stated")
+        return UpDirection(stated, "stated", STATED_DEG)
     up = -rotations[:, :, 1].mean(0)
-    return UpDirection(up / np.linalg.norm(up), CAMERA_UP_CONE_DEG, "cameras")
+    return UpDirection(up / np.linalg.norm(up), "cameras")
 
 
 def trunk_direction(joints: np.ndarray) -> np.ndarray:
@@ -137,7 +136,7 @@ def estimate_up(rough: UpDirection, evidence: Sequence[LevelDirections]) -> UpDi
     excess = float((weight * (levels @ up) ** 2).sum()) / max(len(levels) - 2, 1)
     deviation = np.sqrt(max(1.0, excess) * (1 / np.maximum(information[1:], 1e-9)).sum())
     degrees = min(float(np.degrees(deviation)), 90.0)
-    return UpDirection(up, min(3 * degrees, 90.0), ", ".join(e.source for e in evidence), degrees)
+    return UpDirection(up, ", ".join(e.source for e in evidence), degrees)
 
 
 def camera_levels(rig: Rig, gravity: np.ndarray) -> list[LevelDirections]:
@@ -194,7 +193,8 @@ def balance_levels(joints: np.ndarray) -> list[LevelDirections]:
     if len(axis) < 5:
         return []
     across = np.linalg.svd(axis.mean(0, keepdims=True))[2][1:]
-    return [LevelDirections(across, np.full(2, np.radians(BALANCE_DEG)), "balance")]
+    # the place below the centre, 1 m high, is distributed uniformly over a foot
+    return [LevelDirections(across, np.full(2, FOOT_M / np.sqrt(12)), "balance")]
 
 
 def floor_levels(points: np.ndarray, sigma_m: float) -> list[LevelDirections]:
@@ -235,7 +235,7 @@ def check_stated_up(
     off = degrees_between(stated, without.direction)
     if without.source == "gravity":
         note = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"
-        return [f"{note}, which were believed"] * (off > GRAVITY_CONE_DEG)
+        return [f"{note}, which were believed"] * (off > without.cone_deg)
     leans = degrees_between(stated, trunk)
     # a wrong axis is 90 degrees off; the cameras' mean up and the trunk of a bending person less
     wrong = 60.0
@@ -247,7 +247,7 @@ def check_stated_up(
             "or leave the column empty"
         )
     notes = []
-    if off > CAMERA_UP_CONE_DEG:
+    if off > without.cone_deg:
         notes.append(f"the stated up is {off:.0f} degrees from the cameras' mean up")
     if leans > wrong:
         notes.append(f"the stated up is {leans:.0f} degrees from the person's trunk")

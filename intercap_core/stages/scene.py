@@ -227,7 +227,7 @@ def _with_feet(
         if floor is not None:
             levels = floor_levels(np.array(floor, np.float64), ANNOTATED_POINT_M)
             off = float(np.degrees(np.linalg.norm(levels[0].sigma))) if levels else np.nan
-        up = UpDirection(ground.normal, off, "floor", off)
+        up = UpDirection(ground.normal, "floor", off)
     else:
         joints = triangulate_views(subject.keypoints, rig).joints
         feet = joints[:, toes_and_heels]
@@ -239,7 +239,7 @@ def _with_feet(
             )
             if not denied:
                 ground = stated_ground(*stated)
-                up = UpDirection(stated[0], STATED_DEG, "stated", STATED_DEG)
+                up = UpDirection(stated[0], "stated", STATED_DEG)
     notes = [ground.note] if ground.note else []
     if ground.found and ground.source != "feet":
         above = describe_raised_feet(subject.joints[:, toes_and_heels], ground)
@@ -256,7 +256,7 @@ def _estimated_up(source: Frames, rig: Rig, joints: np.ndarray, feet: np.ndarray
     """
     rough = _up(source, rig)
     if rough.source == "stated":
-        return replace(rough, deviation_deg=STATED_DEG)
+        return rough
     standing, _ = standing_on_floor(feet, rough.direction)
     evidence = [
         *camera_levels(rig, source.gravity),

@@ -139,11 +139,17 @@ class Detector:
         pixels = pixels + error * unit_px
 
         confidence = self._confidence(rng, error, hidden)
-        pixels, confidence = self._swapped(rng, pixels, confidence)
+        return self._in_image(camera, at[..., 2], *self._swapped(rng, pixels, confidence))
+
+    @staticmethod
+    def _in_image(
+        camera: Camera, depth: np.ndarray, pixels: np.ndarray, confidence: np.ndarray
+    ) -> np.ndarray:
+        """Keypoints (T, 135, 3), without confidence outside of the image or behind the camera."""
         inside = (pixels > -0.5).all(-1) & (
             pixels < (camera.colour.width - 0.5, camera.colour.height - 0.5)
         ).all(-1)
-        confidence = np.where(inside & (at[..., 2] > 0.1), confidence, 0)
+        confidence = np.where(inside & (depth > 0.1), confidence, 0)
         return np.concatenate([pixels, confidence[..., None]], -1)
 
     def _pixels_per_metre(self, camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -157,12 +157,7 @@ class MeasuredDetector(Detector):
         confidence[:, RIGHT_HAND.stop :] = confidence[:, [_NOSE]] * self._sees_face(
             rng, camera, points
         )
-        pixels, confidence = self._swapped(rng, pixels, confidence)
-        inside = (pixels > -0.5).all(-1) & (
-            pixels < (camera.colour.width - 0.5, camera.colour.height - 0.5)
-        ).all(-1)
-        confidence = np.where(inside & (at[..., 2] > 0.1), confidence, 0)
-        return np.concatenate([pixels, confidence[..., None]], -1)
+        return self._in_image(camera, at[..., 2], *self._swapped(rng, pixels, confidence))
 
     def people(self, camera: Camera, subject: np.ndarray) -> list[list[np.ndarray]]:
         """The subject (135, 3) in each frame's file unless missed; nobody else is reported."""
