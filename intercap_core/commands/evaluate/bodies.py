@@ -221,7 +221,6 @@ def _print_worst(console: Console, evaluations: Sequence[Bodies]) -> None:
 PART = EvaluationPart(
     name="bodies",
     stage="body_fit",
-    reads=("frames", "scene", "person"),
     settings=(
         *config_files("object", "config", "noise_2", "family_b"),
         *config_files(
@@ -234,5 +233,4 @@ PART = EvaluationPart(
     flat=flat,
     print_tables=print_bodies,
     rig=lambda project: rig_of(project.config),
-    kept=BodyErrors,
 )  # fmt: skip

@@ -86,11 +86,9 @@ def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
 PART = EvaluationPart(
     name="captures",
     stage="scene",
-    reads=("frames",),
     settings=config_files("capture", "config", "family_b", "noise_2"),
     budget_minutes=4.6,
     measure=measure,
     flat=flat,
     print_tables=print_captures,
-    kept=CaptureErrors,
 )

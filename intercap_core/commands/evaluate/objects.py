@@ -128,12 +128,10 @@ def has_object(project: Project, sequence: str) -> bool:
 PART = EvaluationPart(
     name="objects",
     stage="object_track",
-    reads=("scene",),
     settings=config_files("object", "config", "no_detector", "noise_2", "family_b"),
     budget_minutes=7.4,
     measure=measure,
     flat=flat,
     print_tables=print_objects,
-    kept=ObjectErrors,
     has=has_object,
 )

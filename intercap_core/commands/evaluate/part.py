@@ -1,26 +1,21 @@
-"""Common code of the parts of an evaluation: measure recordings, cache errors, print tables."""
+"""Common code of the parts of an evaluation: measure recordings, print tables."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.arrays import read_pickle
-from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import Project, load_project
 
 Errors = TypeVar("Errors")
@@ -54,11 +49,9 @@ class EvaluationPart(Generic[Errors]):
     """One part of the evaluation: how its recordings are computed, measured and reported."""
 
     name: str
-    """Name of the module in this package, whose code digest is part of the key of cached errors."""
+    """Name of the module in this package."""
     stage: str
     """Stage whose artefact is compared with the truth."""
-    reads: tuple[str, ...] = ()
-    """Other stages whose artefacts are read."""
     settings: Sequence[Path]
     """Settings files that are evaluated by default."""
     budget_minutes: float
@@ -72,8 +65,6 @@ class EvaluationPart(Generic[Errors]):
     """Prints the tables of all projects."""
     rig: Callable[[Project], str] = lambda _: ""
     """Describes the cameras and data that a project's settings select."""
-    kept: type[Errors] | None = None
-    """Dataclass of the errors that are cached on disk; None to measure them in every run."""
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
     """Whether (project, sequence) has the measured quantity."""
     last: Callable[[Project], str | None] = lambda _: None
@@ -130,65 +121,18 @@ class EvaluationPart(Generic[Errors]):
 
 def _measure_recording(part: str, settings: Path, sequence: str) -> Any:
     module = import_module(f"intercap_core.commands.evaluate.{part}")
-    return measure_cached(module.PART, load_project(settings), sequence)
+    return measure_recording(module.PART, load_project(settings), sequence)
 
 
-def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
-    """Errors of one recording, from the cache if all inputs are unchanged.
-
-    The cache file is next to the artefacts. Its name contains the digest of the inputs: artefacts,
-    truth, mesh, the entries of object and subject, the setting body_models, and code.
-    """
+def measure_recording(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
+    """Errors of one recording. Raises UserError if its truth is missing."""
     truth = truth_of(project, sequence)
     if not truth.is_file():
         raise UserError(
             f"{truth}: the truth of {sequence!r} is missing, but its {part.stage} artefact exists; "
             f"remove {project.results / sequence} and start again: both will be recomputed"
         )
-    if part.kept is None:
-        return part.measure(project, sequence)
-    state = hashlib.sha256(code_digest(f"commands.evaluate.{part.name}").encode())
-    row = project.sequences[sequence]
-    entry, subject = project.object_of(sequence), project.subjects[row.subject]
-    for setting in (*filter(None, [entry]), subject, project.config.body_models):
-        state.update(setting.model_dump_json().encode())
-    files = [project.artefact(sequence, stage) for stage in (*part.reads, part.stage)]
-    for path in (*files, truth, *([entry.mesh] if entry else [])):
-        with open(path, "rb") as file:
-            state.update(hashlib.file_digest(file, "sha256").digest())
-    folder = project.results / sequence / "evaluation"
-    path = folder / f"{part.name}-{state.hexdigest()[:24]}.pickle"
-    if path.is_file():
-        return _dataclass_of(part.kept, read_pickle(path))
-    errors = part.measure(project, sequence)
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob(f"{part.name}-*.pickle"):
-        old.unlink()
-    partial = path.with_suffix(f".{os.getpid()}")
-    partial.write_bytes(pickle.dumps(_plain(errors)))
-    partial.replace(path)  # a killed run leaves no partial file under the final name
-    return errors
-
-
-def _plain(value: Any) -> Any:
-    """Convert dataclasses to dictionaries and paths to text, so that the pickle names no class."""
-    if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    return str(value) if isinstance(value, Path) else value
-
-
-def _dataclass_of(kind: Any, values: dict[str, Any]) -> Any:
-    """The inverse of :func:`_plain`."""
-    hints = get_type_hints(kind)
-    made = {
-        name: _dataclass_of(hints[name], value)
-        if is_dataclass(hints[name])
-        else Path(value)
-        if hints[name] is Path
-        else value
-        for name, value in values.items()
-    }
-    return kind(**made)
+    return part.measure(project, sequence)
 
 
 def config_files(folder: str, *names: str) -> tuple[Path, ...]:
