@@ -1,21 +1,18 @@
-"""Bring the workflows of many projects up to date, two at a time; their expected and taken time.
+"""Bring the workflows of many projects up to date, two at a time; the time that they took.
 
 One workflow leaves cores idle while its last long job runs; a second workflow uses them. A project
 that reads the recordings of another project starts after it. Among the projects that can start, the
-one with the longest expected work, including the work that waits for it, is first.
+one with the most jobs, including those that wait for it, is first.
 """
 
 from __future__ import annotations
 
 import csv
 import fcntl
-import math
 import os
-import re
 import subprocess
 import time
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -33,11 +30,6 @@ from intercap_core.stage_list import STAGES
 
 SIDE_BY_SIDE = 2  # workflows at a time
 LOCK = Path(".snakemake") / "evaluation.lock"
-# CPU seconds per frame of six 720P views, measured with `make evaluate-quick` on an AMD EPYC.
-SECONDS_PER_FRAME = {
-    STUDIO: 0.52, "frames": 0.02, "detections": 0.02, "scene": 0.25, "person": 0.15,
-    "object_track": 0.22, "body_fit": 0.17, "joint": 0.37, "metrics": 0.30,
-}  # fmt: skip
 
 
 class Job(NamedTuple):
@@ -87,25 +79,6 @@ def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, list[Job]]:
     return jobs
 
 
-def expected_seconds(job: Job, frames: int) -> float:
-    """Expected CPU seconds of a job whose recording has this number of frames."""
-    config = job.project.config
-    rendered = 6 if config.studio is None else config.studio.cameras
-    views = rendered if job.stage == STUDIO else len(config.frames.cameras) or rendered
-    start = 1.3  # imports, compiled code from the cache
-    return start + SECONDS_PER_FRAME.get(job.stage, 0.3) * views / 6 * frames
-
-
-def frames_of_recordings(projects: Iterable[Project]) -> dict[Path, int]:
-    """Number of frames of each recording that the projects' studios render, by its folder."""
-    return {
-        (project.results / "recordings" / name).resolve(): entry.frames
-        for project in projects
-        if project.config.studio is not None
-        for name, entry in project.config.studio.captures.items()
-    }
-
-
 @dataclass(eq=False)
 class ProjectRun:
     """The workflow of one project, planned, running or ended."""
@@ -113,8 +86,6 @@ class ProjectRun:
     project: Project
     stages: list[str]
     """Target stages."""
-    seconds: dict[str, list[float]]
-    """Expected CPU seconds of all jobs, by rule."""
     after: list[ProjectRun] = field(default_factory=list)
     """Projects that must end before this one starts."""
     watcher: Watcher | None = None
@@ -123,44 +94,6 @@ class ProjectRun:
     """Snakemake's process; None until the workflow has started."""
     status: int | None = None
     """Exit status; None until the workflow has ended."""
-
-    @property
-    def expected(self) -> float:
-        """CPU seconds if no job is up to date."""
-        return sum(map(sum, self.seconds.values()))
-
-    def left(self) -> tuple[float, float]:
-        """Expected CPU seconds of the remaining jobs, and of the completed jobs."""
-        planned = self._planned()
-        mean = {rule: sum(values) / len(values) for rule, values in self.seconds.items()}
-        if self.status is not None:
-            counts = (planned or {}).items()
-            return 0.0, sum(count * mean.get(rule, 0.0) for rule, count in counts)
-        if planned is None or self.watcher is None:
-            return self.expected, 0.0
-        finished = Counter(
-            name.rsplit(": ", 1)[-1]
-            for name, job in self.watcher.jobs().items()
-            if job.state != "running"
-        )
-        todo = done = 0.0
-        for rule, count in planned.items():
-            todo += max(count - finished[rule], 0) * mean.get(rule, 0.0)
-            done += min(finished[rule], count) * mean.get(rule, 0.0)
-        return todo, done
-
-    def _planned(self) -> dict[str, int] | None:
-        """Number of jobs by rule that the workflow has planned; None before planning."""
-        if self.watcher is None or not self.watcher.transcript.is_file():
-            return None
-        text = self.watcher.transcript.read_text(encoding="utf-8", errors="replace")
-        if "Nothing to be done" in text:
-            return {}
-        _, heading, rest = text.partition("Job stats:")
-        if not heading or "\ntotal" not in rest:
-            return None
-        pairs = re.findall(r"^(\w+) +(\d+)$", rest.partition("\ntotal")[0], re.MULTILINE)
-        return {rule: int(count) for rule, count in pairs}
 
 
 def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
@@ -210,15 +143,7 @@ def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
             key = project.path.resolve()
             projects[key] = project
             stages.setdefault(key, []).append(stage)
-    frames = frames_of_recordings(projects.values())
-    runs = []
-    for key, project in projects.items():
-        seconds: dict[str, list[float]] = {}
-        for job in list_jobs(project, stages[key]):
-            # 45 frames, the studio's default, for recordings that none of the projects renders
-            count = frames.get(project.sequences[job.sequence].recordings.resolve(), 45)
-            seconds.setdefault(job.stage, []).append(expected_seconds(job, count))
-        runs.append(ProjectRun(project, stages[key], seconds))
+    runs = [ProjectRun(project, stages[key]) for key, project in projects.items()]
     for run in runs:
         read = {
             row.recordings.resolve()
@@ -235,9 +160,10 @@ def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
             )
         ]
 
-    def urgency(run: ProjectRun) -> float:
-        waiting = sum(other.expected for other in runs if run in other.after)
-        return run.expected + waiting
+    jobs = {run: len(list_jobs(run.project, run.stages)) for run in runs}
+
+    def urgency(run: ProjectRun) -> int:
+        return jobs[run] + sum(jobs[other] for other in runs if run in other.after)
 
     return sorted(runs, key=urgency, reverse=True)
 
@@ -266,22 +192,12 @@ def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: 
         now = time.monotonic()
         if now - reported > 60.0:
             reported = now
-            console.print(progress(runs, parallel, now - begin), highlight=False, markup=False)
-
-
-def progress(runs: Sequence[ProjectRun], parallel: int, elapsed: float) -> str:
-    """Report of the completed projects and the remaining minutes at the present pace.
-
-    The minutes are an upper bound: until a workflow has planned its jobs, all of them count.
-    """
-    # expected CPU seconds of remaining and of completed jobs
-    left, done = (sum(values) for values in zip(*(o.left() for o in runs), strict=True))
-    pace = elapsed * parallel / done if done > 60 else 1.0  # seconds per expected second
-    ended = sum(run.status is not None for run in runs)
-    return (
-        f"{ended} of {len(runs)} projects done after {elapsed / 60:.0f} minutes, at most "
-        f"{math.ceil(left * pace / parallel / 60)} left"
-    )
+            ended = sum(run.status is not None for run in runs)
+            minutes = (now - begin) / 60
+            console.print(
+                f"{ended} of {len(runs)} projects done after {minutes:.0f} minutes",
+                highlight=False, markup=False,
+            )  # fmt: skip
 
 
 def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
