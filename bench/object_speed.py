@@ -6,8 +6,7 @@ Needs the artefacts of ``intercap bench``. On its first sequence shorter schedul
 are measured too. Then tracker and recipe are compared on ``--frames`` frames of one recording of
 each object (config/object; recordings that do not exist are made). Both get the same frames,
 decoded and reduced in advance, the same first pose (the true pose with an error of 10 mm and 5
-degrees) and the same number of threads. Adds figures with keys ``object.<measure>`` to the output
-and draws ``object_convergence.png`` next to the artefacts.
+degrees) and the same number of threads. Adds figures with keys ``object.<measure>`` to the output.
 """
 
 from __future__ import annotations
@@ -30,14 +29,12 @@ from rich.progress import track
 from rich.table import Table
 
 from bench.clips import ObjectClip
-from bench.command import add_figures, figure_class, from_command_line
+from bench.command import add_figures, from_command_line
 from bench.object_baseline import FrameFit, Recipe, fit_by_adam
-from bench.object_scaling import tracking_scaling
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
-from intercap_core.geometry.camera.transforms import apply_step, rigid
-from intercap_core.object_track.fit import FIT_ROUNDS, MotionPrior, fit_pose
+from intercap_core.object_track.fit import FIT_ROUNDS, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.motion import extrapolate, predict_prior
 from intercap_core.object_track.view import View
@@ -241,19 +238,16 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         **reached.figures("baseline_until_"),
         "frames": len(clip),
         "threads": THREADS,
-        **tracking_scaling(clip.whole),
     }
     compared = compare_recordings(RECORDINGS, frames)
     add_figures(output, "object", {**figures, **compared_figures(compared)})
-    picture = project.results / "object_convergence.png"
-    draw_convergence(clip, picture)
     title = (
         f"{sequence}: {len(clip)} frames, {len(clip.views[0])} views, {len(clip.mesh.faces)} "
         f"faces, {THREADS} thread{'s' * (THREADS > 1)} each"
     )
     _print(title, ours, single, found, reached, figures)
     print_compared(compared)
-    print(output, picture, sep="\n")
+    print(output)
 
 
 def compare_recordings(settings: Path, frames: int) -> dict[str, tuple[Run, Run]]:
@@ -343,89 +337,6 @@ def _print(
         f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy (*)",
         highlight=False,
     )
-    grown = Table("a fit of one frame, or a drawn image", "ms", box=None)
-    for key, value in figures.items():
-        if key.startswith(("fit_ms_", "draw_ms_")):
-            grown.add_row(key.replace("_ms", "").replace("_", " "), f"{value:.2f}")
-    console.print(grown)
-
-
-CONVERGENCE_FRAMES = 10
-OFF_M, OFF_DEG = 0.03, 10.0
-CONVERGENCE_ROUNDS = [(n,) for n in range(1, 5)] + [(4, n) for n in range(1, 6)]
-CONVERGENCE_STEPS = 150
-FASTER = Recipe(learning_rate_m=4e-3, learning_rate_rad=8e-3)
-
-
-def draw_convergence(clip: ObjectClip, output: Path) -> None:
-    """Plot the error of fits that start 3 cm and 10 degrees off the truth over time.
-
-    ``CONVERGENCE_FRAMES`` frames are fitted, with seeded directions of the offset.
-
-    Medians over the frames against the median time from the fit's begin, everything included that
-    is done for one frame. Ours are fits that were stopped after as many steps. Raises UserError
-    where matplotlib is not installed.
-    """
-    figure_of = figure_class()
-
-    frames = np.flatnonzero(clip.seen)
-    frames = frames[
-        np.linspace(0, len(frames) - 1, min(CONVERGENCE_FRAMES, len(frames))).round().astype(int)
-    ]
-    starts = [_offset_start(clip, int(t)) for t in frames]
-    lines = {"Gauss-Newton (ours)": _convergence_of_ours(clip, frames, starts)}
-    for name, recipe in (
-        ("Adam, the paper's recipe", Recipe()),
-        (f"Adam, learning rate {FASTER.learning_rate_m:g}", FASTER),
-    ):
-        lines[name] = _convergence_of_recipe(clip, frames, starts, recipe)
-    figure = figure_of(figsize=(7.5, 3.2), layout="constrained")
-    for axes, column, label in zip(figure.subplots(1, 2), (1, 2), ("mm", "degrees"), strict=True):
-        for name, points in lines.items():
-            axes.plot(points[:, 0], points[:, column], label=name, marker=".", markersize=3)
-        axes.set(xscale="log", yscale="log", xlabel="seconds a frame", ylabel=f"error, {label}")
-        axes.grid(alpha=0.3, which="both")
-    figure.axes[0].legend(fontsize="small")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=150, metadata={"Software": None})
-
-
-def _offset_start(clip: ObjectClip, t: int) -> np.ndarray:
-    turn, shift = np.random.default_rng(t).normal(size=(2, 3))
-    turn *= np.radians(OFF_DEG) / np.linalg.norm(turn)
-    shift *= OFF_M / np.linalg.norm(shift)
-    return apply_step(
-        rigid(clip.true_rotation[t], clip.true_translation[t]), np.append(turn, shift)
-    )
-
-
-def _convergence_of_ours(
-    clip: ObjectClip, frames: np.ndarray, starts: list[np.ndarray]
-) -> np.ndarray:
-    """Rows (steps, 3) of seconds, millimetres and degrees."""
-    rows: list[np.ndarray] = []
-    context = clip.observer().context
-    for rounds in CONVERGENCE_ROUNDS:
-        found: list[tuple[float, ...]] = []
-        for t, start in zip(frames, starts, strict=True):
-            begin = time.perf_counter()
-            fit = fit_pose(context, clip.views[t], start, rounds=rounds)
-            seconds = time.perf_counter() - begin
-            found.append((seconds, *map(float, clip.errors(fit.pose, int(t)))))
-        rows.append(np.median(found, axis=0))
-    return np.array(rows)
-
-
-def _convergence_of_recipe(
-    clip: ObjectClip, frames: np.ndarray, starts: list[np.ndarray], recipe: Recipe
-) -> np.ndarray:
-    """Rows (steps, 3) as of :func:`_convergence_of_ours`."""
-    found = []
-    for t, start in zip(frames, starts, strict=True):
-        fit = fit_frame(clip, clip.views[t], start, recipe, CONVERGENCE_STEPS)
-        if len(fit.poses) == CONVERGENCE_STEPS + 1:  # something was seen
-            found.append(np.stack([fit.seconds, *clip.errors(fit.poses, int(t))], 1)[1:])
-    return np.median(found, axis=0)
 
 
 if __name__ == "__main__":
