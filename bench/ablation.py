@@ -6,8 +6,8 @@
 Stages `joint` and `metrics` are computed for each variant in ``VARIANTS`` from the artefacts of a
 run of SETTINGS (default: those of `make evaluate-quick`, which must have run). Results that are up
 to date by their content are reused, so an interrupted run continues. Prints a table, writes its
-figures with keys ``<variant>.<measure>``, the table as Markdown and three pictures (grasps.jpg,
-acceleration.png, contact_path.png) into the folder. No file of the project is overwritten.
+figures with keys ``<variant>.<measure>``, and the table as Markdown into the folder. No file of the
+project is overwritten.
 """
 
 from __future__ import annotations
@@ -20,244 +20,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from bench.again import artefacts_of, check_run, compute_once, slug
-from bench.command import exit_on_user_error, figure_class
-from intercap_core import artefacts
+from bench.command import exit_on_user_error
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.proximity import PosedObject
-from intercap_core.evaluation.tracks import read_body, read_object
-from intercap_core.evaluation.truth import Truth
 from intercap_core.joint.problem import TERMS
-from intercap_core.joint.terms.stick import local_points
-from intercap_core.output.site.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.project import Project, load_project
-from intercap_core.schemas import SCENE
-from intercap_core.sequence_inputs import SequencePaths
-
-Paths = Mapping[str, Mapping[str, Mapping[str, Path]]]  # by variant, sequence and stage
-# Variants of the ablation that the pictures show
-EVERYTHING = "everything"
-WITHOUT_CONTACT, WITHOUT_STICK = "without contact and stick", "without stick"
-WITHOUT_SMOOTHNESS = "without smoothness"
-_COLOURS = {"truth": "#222222", "sequential": "#b0b6bf", "without": "#e07a1f", "joint": "#2f6fdb"}
-_MIN_HOLD_S = 0.5  # shorter holds have no path to look at
-_HEAD_PX, _INK = 24, (52, 44, 40)
-
-
-def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
-    """Draw the pictures that the computed variants allow into ``folder``; returns their paths.
-
-    Raises UserError if matplotlib is not installed.
-    """
-    figure = figure_class()
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = [
-        _grasps(project, paths, folder / "grasps.jpg"),
-        _accelerations(project, paths, folder / "acceleration.png", figure),
-        _contact_paths(project, paths, folder / "contact_path.png", figure),
-    ]
-    return [path for path in drawn if path is not None]
-
-
-def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
-    """The longest grasp of every sequence, with and without contact and stick, and the truth."""
-    if not {EVERYTHING, WITHOUT_CONTACT} <= set(paths):
-        return None
-    sheets = []
-    for name, by_stage in paths[EVERYTHING].items():
-        handling = read_handling(
-            SequencePaths(**by_stage),
-            project.models(name),
-            truth=project.sequences[name].truth,
-            joints={
-                "no contact/stick": paths[WITHOUT_CONTACT][name]["joint"],
-                "joint": by_stage["joint"],
-            },
-        )
-        for hold in holds(handling.probability)[:1]:
-            picture = closeup(handling, hold)
-            sheet = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
-            head = np.full((_HEAD_PX, sheet.shape[1], 3), 255, np.uint8)
-            words = f"{name}: {hold.caption}".replace("–", "-")
-            cv2.putText(head, words, (3, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)
-            sheets += [head, sheet]
-    if not sheets:
-        return None
-    cv2.imwrite(str(output), np.vstack(sheets), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    return output
-
-
-@dataclass(frozen=True, eq=False)
-class _Track:
-    """Skin (T, V, 3) and object poses of one variant, master frame, metres."""
-
-    skin: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def local(self, vertex: int) -> np.ndarray:
-        """Path (T, 3) of a skin vertex in the object's frame."""
-        points = self.skin[:, vertex : vertex + 1].astype(np.float64)
-        return local_points(points, self.rotation, self.translation)[:, 0]
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """Tracks of one sequence by variant, and "truth"."""
-
-    tracks: Mapping[str, _Track]
-    """By variant."""
-    truth: Truth
-    regions: Mapping[str, np.ndarray]
-    """Vertices of the body by region."""
-    fps: float
-
-
-def _read(project: Project, paths: Paths, sequence: str, versions: Mapping[str, str]) -> _Known:
-    """Read the variants of a sequence; "" stands for the sequential fits."""
-    row, models = project.sequences[sequence], project.config.body_models
-    gender = project.subjects[row.subject].gender
-    tracks, model = {}, None
-    for name, variant in versions.items():
-        by_stage = paths[variant or EVERYTHING][sequence]
-        stages = ("joint", "joint") if variant else ("body_fit", "object_track")
-        body = read_body(by_stage[stages[0]], stages[0], models, gender)
-        pose = read_object(by_stage[stages[1]], stages[1])
-        tracks[name] = _Track(np.stack(list(body.vertices())), pose.rotation, pose.translation)
-        model = body.model
-    assert model is not None and row.truth is not None
-    with artefacts.read(paths[EVERYTHING][sequence]["scene"], SCENE) as scene:
-        times, fps = scene["times"], float(scene.attributes["fps"])
-    truth = Truth.load(row.truth, times, fps, model.num_vertices)
-    assert truth.vertices is not None
-    tracks["truth"] = _Track(truth.vertices, truth.rotation, truth.translation)
-    regions = {name: np.asarray(ids) for name, ids in model.regions.items()}
-    return _Known(tracks, truth, regions, fps)
-
-
-def _accelerations(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Plot the acceleration of the skin vertex that smoothing changes most, for each sequence.
-
-    The legend has the mean errors against the truth.
-    """
-    if not {EVERYTHING, WITHOUT_SMOOTHNESS} <= set(paths):
-        return None
-    versions = {"without smoothness": WITHOUT_SMOOTHNESS, "joint": EVERYTHING}
-    names = list(paths[EVERYTHING])
-    sheet = figure(figsize=(9, 2.3 * len(names)), layout="constrained")
-    rows = np.atleast_1d(sheet.subplots(len(names), 1))
-    for axes, name in zip(rows, names, strict=True):
-        found = _read(project, paths, name, versions)
-        every = {
-            label: np.diff(track.skin, n=2, axis=0) * np.float32(found.fps**2)
-            for label, track in found.tracks.items()
-        }
-        change = np.linalg.norm(every["joint"] - every["without smoothness"], axis=2)
-        vertex = int(change.mean(0).argmax())
-        for label, vectors in every.items():
-            size = np.linalg.norm(vectors[:, vertex], axis=1)
-            off = np.linalg.norm((vectors - every["truth"])[:, vertex], axis=1).mean()
-            words = label if label == "truth" else f"{label}, off by {off:.1f} m/s²"
-            when = (np.arange(len(size)) + 1) / found.fps
-            axes.plot(when, size, label=words, color=_colour(label), linewidth=1.4)
-        region = next((r for r, ids in found.regions.items() if vertex in ids), "skin")
-        axes.set(ylabel="m/s²", title=f"{name}: a vertex of the {region.replace('_', ' ')}")
-        axes.set_ylim(bottom=0)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    rows[-1].set_xlabel("seconds; acceleration of the vertex that smoothing changes most")
-    sheet.savefig(output, dpi=110, metadata={"Software": None})
-    return output
-
-
-def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Plot the path of the vertex with the longest true contact, in the object's frame.
-
-    The origin is the middle of the true path; a large dot marks its start.
-    """
-    if not {EVERYTHING, WITHOUT_STICK} <= set(paths):
-        return None
-    versions = {"sequential": "", "without stick": WITHOUT_STICK, "joint": EVERYTHING}
-    known = _held(project, paths, versions)
-    if not known:
-        return None
-    sheet = figure(figsize=(4.2 * len(known), 5.8), layout="constrained")
-    columns = np.atleast_1d(sheet.subplots(1, len(known)))
-    for axes, (name, (found, vertex, frames)) in zip(columns, known.items(), strict=True):
-        local = {label: track.local(vertex)[frames] for label, track in found.tracks.items()}
-        start = local["truth"].mean(0)
-        spread = np.concatenate([path - path.mean(0) for path in local.values()])
-        plane = np.linalg.svd(spread, full_matrices=False)[2][:2]
-        for label, path in local.items():
-            x, y = 1e3 * plane @ (path - start).T
-            length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-            axes.plot(x, y, label=f"{label}, {1e3 * length:.0f} mm", color=_colour(label),
-                      linewidth=1.2, marker=".", markersize=3)  # fmt: skip
-            axes.plot(x[0], y[0], "o", color=_colour(label), markersize=5)
-        drawn = 1e3 * np.concatenate([path - start for path in local.values()]) @ plane.T
-        middle, reach = (drawn.max(0) + drawn.min(0)) / 2, 0.54 * np.ptp(drawn, axis=0).max()
-        axes.set(
-            title=f"{name}\na contact point on the object", xlabel="mm", aspect="equal",
-            xlim=(middle[0] - reach, middle[0] + reach),
-            ylim=(middle[1] - reach, middle[1] + reach),
-        )  # fmt: skip
-        axes.grid(alpha=0.3)
-        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2}
-        axes.legend(fontsize="small", title="length of the path", title_fontsize="small", **below)
-    columns[0].set_ylabel("mm")
-    sheet.savefig(output, dpi=110, metadata={"Software": None})
-    return output
-
-
-def _held(
-    project: Project, paths: Paths, versions: Mapping[str, str]
-) -> dict[str, tuple[_Known, int, np.ndarray]]:
-    """Vertex with the longest true contact, and the frames of it, by sequence with a hold."""
-    found = {}
-    for name in paths[EVERYTHING]:
-        known = _read(project, paths, name, versions)
-        true, skin = known.truth, known.tracks["truth"].skin
-        hands = np.concatenate([known.regions[f"{side}_hand"] for side in SIDES])
-        surface = PosedObject(true.object_vertices, true.object_faces)
-        touching = np.stack(
-            [
-                surface.signed_distance(
-                    points[hands].astype(np.float64), true.rotation[t], true.translation[t]
-                )
-                < CONTACT_M
-                for t, points in enumerate(skin)
-            ]
-        )
-        longest = int(touching.sum(0).argmax())
-        frames = np.flatnonzero(touching[:, longest])
-        if len(frames) >= _MIN_HOLD_S * known.fps:
-            found[name] = (known, int(hands[longest]), frames)
-    return found
-
-
-def _colour(label: str) -> str:
-    return next(colour for name, colour in _COLOURS.items() if label.startswith(name))
-
 
 SETTINGS = Path("config/evaluation/quick.yaml")
 STAGES = ("joint", "metrics")  # what is computed for each variant
 SEQUENTIAL = "sequential only"
 # Settings of `joint` that differ from the project's, by the variant's name.
 VARIANTS: dict[str, dict[str, Any]] = {
-    EVERYTHING: {},
+    "everything": {},
     "without contact": {"contact_weight": 0.0},
-    WITHOUT_STICK: {"stick_weight": 0.0},
-    WITHOUT_CONTACT: {"contact_weight": 0.0, "stick_weight": 0.0},
+    "without stick": {"stick_weight": 0.0},
+    "without contact and stick": {"contact_weight": 0.0, "stick_weight": 0.0},
     "without planting": {"plant_weight": 0.0},
-    WITHOUT_SMOOTHNESS: {"body_smoothness": 0.0, "object_smoothness": 0.0},
+    "without smoothness": {"body_smoothness": 0.0, "object_smoothness": 0.0},
     "without penetration": {"penetration_weight": 0.0},
     "without ground": {"ground_weight": 0.0},
     "without drift": {"drift_weight": 0.0},
@@ -306,11 +90,10 @@ Paths = dict[str, dict[str, dict[str, Path]]]  # by variant, sequence and stage
 
 def ablate(
     settings: Path, sequences: Sequence[str], variants: Sequence[str], folder: Path
-) -> tuple[Paths, dict[str, Figures]]:
-    """Compute all variants; returns their artefacts, and figures by variant.
+) -> dict[str, Figures]:
+    """Compute all variants; returns figures by variant, the last entry of the sequential fits.
 
-    The last entry of the figures is that of the sequential fits. Raises UserError if a sequence
-    or variant is unknown, or has no truth or artefacts.
+    Raises UserError if a sequence or variant is unknown, or has no truth or artefacts.
     """
     plain = load_project(settings)
     names = list(sequences or plain.sequences)
@@ -334,7 +117,7 @@ def ablate(
                 seconds = time.perf_counter() - begin
                 progress.console.print(f"{variant}: {name}, {seconds:.0f} s", highlight=False)
                 progress.advance(task)
-    return paths, {
+    return {
         **{variant: _figures(found, sequential=False) for variant, found in paths.items()},
         SEQUENTIAL: _figures(next(iter(paths.values())), sequential=True),
     }
@@ -390,7 +173,7 @@ def markdown(figures: Mapping[str, Figures], settings: Path, sequences: Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line, compute, and write table, figures and pictures."""
+    """Read the command line, compute, and write table and figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -405,8 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with exit_on_user_error():
         names = options.sequences or list(load_project(options.settings).sequences)
         variants = options.variants or list(VARIANTS)
-        paths, figures = ablate(options.settings, names, variants, options.folder)
-        pictures = draw_pictures(load_project(options.settings), paths, options.folder)
+        figures = ablate(options.settings, names, variants, options.folder)
     variant = Column("variant", no_wrap=True)
     table = Table(variant, *(measure.title for measure in MEASURES), box=None)
     for row in rows(figures):
@@ -423,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(flat, indent=1) + "\n", encoding="utf-8")
-    for path in (options.output, section, *pictures):
+    for path in (options.output, section):
         print(path)
 
 

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from intercap_core.commands import bench as commands
 from intercap_core.errors import UserError
@@ -49,15 +48,3 @@ def from_command_line(
     arguments = parser.parse_args()
     with exit_on_user_error():
         measure(arguments.settings, arguments.output, getattr(arguments, counted))
-
-
-def figure_class() -> Any:
-    """Return matplotlib's class of figures; raises UserError if it is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UserError(
-            "pictures of comparisons are drawn by matplotlib, which is not installed; install it "
-            "with pip install 'intercap-core[bench]'"
-        ) from error
-    return Figure
