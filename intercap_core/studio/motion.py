@@ -321,7 +321,7 @@ class Puppet:
         wrist = self.idle_wrist(world, pelvis, side, swing)
         position = sum(offsets, wrist.position)
         self.arm_to(world, pelvis, side, WristPose(position, wrist.rotation))
-        self.fingers(world, side, self.finger_track(side, RELAXED, []))
+        self.fingers(world, side, self.finger_track(side, []))
 
     def fingers(self, world: np.ndarray, side: int, vectors: np.ndarray) -> None:
         """Set the fingers' rotation vectors (N, 15, 3) relative to their parents, in place."""
@@ -331,12 +331,10 @@ class Puppet:
             parent = hand.wrist if joint % 3 == 0 else hand.first + joint - 1
             world[:, hand.first + joint] = world[:, parent] @ local[:, joint]
 
-    def finger_track(
-        self, side: int, start: HandShape, keys: list[tuple[np.ndarray, HandShape]]
-    ) -> np.ndarray:
-        """Rotation vectors (N, 15, 3): from ``start`` to each shape in turn by its share (N,)."""
+    def finger_track(self, side: int, keys: list[tuple[np.ndarray, HandShape]]) -> np.ndarray:
+        """Rotation vectors (N, 15, 3): from relaxed to each shape in turn by its share (N,)."""
         hand = self.hands[side]
-        vectors = hand.local(start)[None]
+        vectors = hand.local(RELAXED)[None]
         for share, goal in keys:
             s = share[:, None, None]
             vectors = (1 - s) * vectors + s * hand.local(goal)[None]

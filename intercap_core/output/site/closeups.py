@@ -7,7 +7,7 @@ picture is one result; all columns have the same viewpoints.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,19 +125,8 @@ class Hold:
         return f"{self.side} hand, frames {span}, drawn at {self.frame}"
 
 
-def read_handling(
-    paths: SequencePaths,
-    models: SequenceModels,
-    *,
-    truth: Path | None,
-    joints: Mapping[str, Path] | None = None,
-) -> Handling:
-    """Read the artefacts of a sequence with an object.
-
-    Args:
-        truth: truth file, None if unknown.
-        joints: joint.h5 by name of their column, the last of which defines the holds; by default
-            the columns are "sequential" and "joint" of the sequence's own artefacts.
+def read_handling(paths: SequencePaths, models: SequenceModels, *, truth: Path | None) -> Handling:
+    """Read the artefacts of a sequence with an object; ``truth``: file, None if unknown.
 
     Raises UserError as reading does.
     """
@@ -145,22 +134,23 @@ def read_handling(
     mesh = ObjectMesh.load(models.object_)
     body_models, gender = models.body_models, models.gender
 
-    def column(name: str, body: tuple[Path, str], object_: tuple[Path, str]) -> Column:
-        track, pose = read_body(*body, body_models, gender), read_object(*object_)
-        return Column(
-            name, track.frame, mesh.vertices, mesh.faces, mesh.watertight, pose.rotation,
+    joint_body = read_body(paths.joint, "joint", body_models, gender)
+    columns = [
+        Column(
+            name, body.frame, mesh.vertices, mesh.faces, mesh.watertight, pose.rotation,
             pose.translation,
-        )  # fmt: skip
-
-    columns = []
-    if joints is None:
-        joints = {"joint": paths.joint}
-        sequential = (paths.body_fit, "body_fit"), (paths.object_track, "object_track")
-        columns.append(column("sequential", *sequential))
-    columns += [column(name, (path, "joint"), (path, "joint")) for name, path in joints.items()]
-    last = list(joints.values())[-1]
-    model = read_body(last, "joint", body_models, gender).model
-    with artefacts.read(last, JOINT) as joint:
+        )
+        for name, body, pose in (
+            (
+                "sequential",
+                read_body(paths.body_fit, "body_fit", body_models, gender),
+                read_object(paths.object_track, "object_track"),
+            ),
+            ("joint", joint_body, read_object(paths.joint, "joint")),
+        )
+    ]  # fmt: skip
+    model = joint_body.model
+    with artefacts.read(paths.joint, JOINT) as joint:
         regions = joint.text("region_names")
         hands = [regions.index(f"{side}_hand") for side in SIDES]
         probability = joint["contact_probability"][:, hands]

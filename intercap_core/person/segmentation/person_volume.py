@@ -207,7 +207,7 @@ class MovingPerson:
         if frame_from_master is not None:
             joints = apply(frame_from_master, joints.reshape(-1, 3)).reshape(joints.shape)
         # sets more than half a second from the nearest known one stay unknown; tuned on the studio
-        self.joints = fill_short_gaps(joints, times, max_gap_s=0.5)
+        self.joints = fill_short_gaps(joints, times)
         self._sigma = np.nan_to_num(sigma)
         self._velocity = np.nan_to_num(
             # at most 8 m/s: hands reach 5 m/s in everyday tasks
@@ -228,16 +228,16 @@ class MovingPerson:
         return build_bones(self.joints[t], self._sigma[t])
 
 
-def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
+def fill_short_gaps(joints: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Fill short gaps of keypoints (T, K, 3), NaN = unknown, by linear interpolation.
 
-    A set is filled if the keypoint is known in some set within ``max_gap_s``. Before the first and
+    A set is filled if the keypoint is known in some set within 0.5 s. Before the first and
     after the last known set, the nearest position is repeated. ``times``: (T,) seconds.
     """
     result = joints.copy()
     for k in range(joints.shape[1]):
         known = np.isfinite(joints[:, k]).all(1)
         if known.any():
-            near = np.abs(times[:, None] - times[known]).min(1) <= max_gap_s
+            near = np.abs(times[:, None] - times[known]).min(1) <= 0.5
             result[near, k] = filled_linearly(joints[:, k], times, known)[near]
     return result

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.studio.controls import Step, WristPose, plateau
-from intercap_core.studio.hands import RELAXED, shape
+from intercap_core.studio.hands import shape
 from intercap_core.studio.interactions.base import Interaction, Performance
 from intercap_core.studio.motion import LEFT, RIGHT, SIDES, Foot, Trunk
 from intercap_core.studio.room import Box
@@ -154,5 +154,5 @@ class WalkAndWave(Interaction):
                 wrist, raised = wrist.towards(self._waving(world, pelvis, times), up), 0.3 * up
                 keys = [(up, WAVING)]
             puppet.arm_to(world, pelvis, side, wrist, raised)
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, keys))
+            puppet.fingers(world, side, puppet.finger_track(side, keys))
         return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))

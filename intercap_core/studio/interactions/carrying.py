@@ -202,8 +202,8 @@ class HandleCarry(Interaction):
             (ramp(times, 2.46, 2.53), self.hook),
             (ramp(times, 2.63, 2.9), RELAXED),
         ]
-        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, stages))
-        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
+        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, stages))
+        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, []))
         carried = held_object(puppet, world, pelvis, RIGHT, self.object_from_wrist)
         pose = np.where((times <= self.attach_s)[:, None, None], self.pick_pose, carried)
         pose = np.where((times >= self.release_s)[:, None, None], self.place_pose, pose)

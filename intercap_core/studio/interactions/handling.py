@@ -236,7 +236,7 @@ class HandlingScript(Interaction):
             if side == lead:
                 prop = self._held(world, pelvis, times)
         for side in SIDES:
-            track = puppet.finger_track(side, RELAXED, self.finger_keys(side, times))
+            track = puppet.finger_track(side, self.finger_keys(side, times))
             puppet.fingers(world, side, track)
         return Performance(world, pelvis, prop)
 

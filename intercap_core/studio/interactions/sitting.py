@@ -245,8 +245,8 @@ class Sitting(Interaction):
             (ramp(times, 0.7, 1.05), FLAT),
             (ramp(times, 1.4, 1.8), RELAXED),
         ]
-        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, keys))
-        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
+        puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, keys))
+        puppet.fingers(world, LEFT, puppet.finger_track(LEFT, []))
         pose = np.broadcast_to(self.seat, (len(times), 4, 4)).copy()
         return Performance(world, pelvis, pose)
 
