@@ -274,7 +274,7 @@ def test_compiled_terms_equal_torch_in_some_frames(name: str, exact: BodyProblem
     torch.testing.assert_close(problem.cost(own, shared, at), expected.cost, rtol=1e-12, atol=0)
     assert _difference(found.gradient, expected.gradient) < 1e-12
     every = list(OwnLimbs(problem).rows(_moved(problem, bodies, step)))
-    for seed in range(20, 26):
+    for seed in (20, 21):  # any wrong entry changes the product with a random vector
         way = _random(step.shape[1], seed=seed)
         product = expected.hessian @ way + sum(_gauss_newton(rows, step, way) for rows in every)
         assert _difference(found.hessian @ way, product) < 1e-12

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import ExportSettings, MetricsSettings
+from intercap_core.config import ExportSettings, MetricsSettings, PageSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.pipeline.outcome import line
@@ -101,7 +101,8 @@ def test_metrics_are_those_of_our_fit_without_a_verdict(capture, imported):
 
 
 def test_report_names_the_other_program(imported, tmp_path):
-    out = write_site({NAME: imported}, tmp_path / "site")
+    small = PageSettings(cameras=1, frames=1)
+    out = write_site({NAME: imported}, tmp_path / "site", settings=small)
     overview = (out / "site" / "index.html").read_text()
     page = (out / "site" / "sequences" / NAME / "index.html").read_text()
     assert "1 with results of another program" in overview
