@@ -26,10 +26,8 @@ from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
+from intercap_core.scene.starts import PRIOR_OFFSET_S
 
-# Without a prior, seconds: standard deviation of a uniform distribution over +-0.017 s, half the
-# time between frames of a Kinect. Beyond it, an image belongs to another frame set.
-LOOSE_OFFSET_SIGMA_S = 0.010
 POINT_SIGMA_M = 0.03  # prior of e, wide, so that only disagreement of views counts; tuned
 INNOVATION_OUTLIER = 3.0  # standard deviations at which an innovation counts a quarter; tuned
 
@@ -82,7 +80,7 @@ def estimate_offsets(
     has_prior = np.isfinite(prior.sigma)
     expected = np.where(has_prior, prior.offset, 0.0) - current
     # at least 0.5 ms: the prior comes from the same keypoints
-    sigma = np.maximum(np.where(has_prior, prior.sigma, LOOSE_OFFSET_SIGMA_S), 0.0005)
+    sigma = np.maximum(np.where(has_prior, prior.sigma, PRIOR_OFFSET_S), 0.0005)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
     all_innovations = [

@@ -108,7 +108,7 @@ def find_slips(
         evidence = _Evidence(seen, steps, fps)
         best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
         if best:
-            for interval in _apart(best, times):
+            for interval in _apart(best, longest):
                 _apply(slip, interval)
                 if _spans_all(interval, len(times)):
                     always.append(interval)
@@ -153,21 +153,13 @@ def _apply(slip: np.ndarray, interval: SlipInterval) -> None:
     slip[late | _spans_all(interval, len(slip)), interval.camera] += interval.slip
 
 
-def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterval]:
-    """The intervals that are accepted in one round: the best, and others unrelated to it.
-
-    A late camera distorts the triangulated motion, which makes other cameras look late. Intervals
-    that are much weaker than the best or within a second of an accepted one wait for the next
-    round.
-    """
-    ordered = sorted(intervals, key=lambda i: -i.gain)
+def _apart(intervals: list[SlipInterval], margin: int) -> list[SlipInterval]:
+    """The intervals that are accepted in one round, greatest gain first: none within ``margin``
+    sets of another, because a late camera distorts the paths, so that others look late."""
     chosen: list[SlipInterval] = []
-    for interval in ordered:
-        early, late = times[interval.first] - 1.0, times[interval.last] + 1.0
-        # at least a fifth of the best gain; it and the second are tuned on the studio
-        if interval.gain >= 0.2 * ordered[0].gain and all(
-            times[other.last] < early or times[other.first] > late for other in chosen
-        ):
+    for interval in sorted(intervals, key=lambda i: -i.gain):
+        first, last = interval.first - margin, interval.last + margin
+        if all(other.last < first or other.first > last for other in chosen):
             chosen.append(interval)
     return chosen
 
@@ -369,8 +361,7 @@ class _Slipped:
     def best(self, step: int) -> SlipInterval:
         """The interval of greatest gain. Sets are counted within the window; ``camera`` is 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
-        # a cost of 1 for each set keeps intervals short; tuned on the studio
-        gain = interval_gains(self.linear.sum(0) - 1.0, energy)
+        gain = interval_gains(self.linear.sum(0), energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
         return SlipInterval(0, first, end - 1, step, float(gains.sum()), _robust_gain(gains))

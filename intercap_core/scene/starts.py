@@ -19,8 +19,8 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 
-# Standard deviation of the time offset of synchronised devices: a third of 1/30 s. Tuned on the
-# studio.
+# Standard deviation of the time offset of synchronised devices: of a uniform distribution over
+# +-0.017 s, half the time between frames of a Kinect.
 PRIOR_OFFSET_S = 0.01
 NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from intercap_core.joint.time_offsets import (
-    LOOSE_OFFSET_SIGMA_S,
     OffsetEstimate,
     OffsetPrior,
     PointObservations,
     estimate_offsets,
 )
+from intercap_core.scene.starts import PRIOR_OFFSET_S
 
 FPS = 15.0
 T, C, K = 60, 5, 30
@@ -73,7 +73,7 @@ def test_residuals_of_zero_are_no_proof():
     assert (copied.sigma[1:] > 0.3 * without.sigma[1:]).all()
     assert _is_within(copied, 0.004)
     assert _estimate(replace(usual, residual=0 * residual)).sigma[1:] == pytest.approx(
-        LOOSE_OFFSET_SIGMA_S
+        PRIOR_OFFSET_S
     )
 
 
@@ -109,7 +109,7 @@ def test_prior_is_kept_without_motion():
     prior = OffsetPrior(TRUE, np.array([0, 1, 1, np.nan, 2]) * 1e-3, 0)
     estimate = estimate_offsets([still], TIMES, ZERO, prior)
     assert estimate.offset == pytest.approx([0, TRUE[1], TRUE[2], 0, TRUE[4]])
-    assert estimate.sigma == pytest.approx([0, 1e-3, 1e-3, LOOSE_OFFSET_SIGMA_S, 2e-3], rel=1e-3)
+    assert estimate.sigma == pytest.approx([0, 1e-3, 1e-3, PRIOR_OFFSET_S, 2e-3], rel=1e-3)
     without = estimate_offsets([], TIMES, ZERO, prior)
     assert without.offset == pytest.approx(estimate.offset)
 
@@ -119,7 +119,7 @@ def test_camera_without_observations_keeps_its_prior():
     observations.weight[:, 3] = 0
     estimate = _estimate(observations)
     assert estimate.offset[3] == pytest.approx(0)
-    assert estimate.sigma[3] == pytest.approx(LOOSE_OFFSET_SIGMA_S)
+    assert estimate.sigma[3] == pytest.approx(PRIOR_OFFSET_S)
     assert np.abs(estimate.offset - TRUE)[[1, 2, 4]].max() < 1.5e-3
 
 
