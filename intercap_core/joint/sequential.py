@@ -138,6 +138,7 @@ class SequentialFits:
     trust: Trust
     flags: SequentialFlags
     joint_sigma: np.ndarray  # (T, 55) stated standard deviations of the joints' positions, metres
+    hand_sigma: np.ndarray  # (T, 2) those of the smoothed left and right hand, metres
     object_sigma: np.ndarray  # (T,) stated standard deviation of the object's position, metres
 
     @classmethod
@@ -184,6 +185,7 @@ class SequentialFits:
             trust=Trust(~failed, ~lost, marks.resting[1:] & marks.resting[:-1]),
             flags=flags,
             joint_sigma=body["joint_sigma"].astype(float),
+            hand_sigma=hand_sigma,
             # metres; so wide that distances say nothing about contact
             object_sigma=np.where(unknown, 0.5, sigma),
         )

@@ -11,6 +11,8 @@ import logging
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.evaluation.body import BOTH_HANDS
 from intercap_core.evaluation.verdict.hold_out import JudgedPart, JudgedPoints, hold_out
 from intercap_core.evaluation.verdict.stated import FEATURES, estimate_error
 from intercap_core.joint.inputs import open_inputs
@@ -20,6 +22,8 @@ from intercap_core.schemas import SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
+
+_WRISTS = [JOINT_INDEX["left_wrist"], JOINT_INDEX["right_wrist"]]
 
 Values = dict[str, np.ndarray | list[str]]
 
@@ -45,7 +49,7 @@ def reach_verdict(
         estimate_error(
             held,
             part,
-            _sigma(sequential, part, weights[part]),
+            start_sigma(sequential, part, weights[part]),
             _known(sequential, result, part),
         )
         for part in parts
@@ -83,11 +87,17 @@ def reach_verdict(
     return values
 
 
-def _sigma(fits: SequentialFits, part: JudgedPart, weights: np.ndarray) -> np.ndarray:
-    """Standard deviation in space (T,) of a part that the sequential fits state, metres."""
+def start_sigma(fits: SequentialFits, part: JudgedPart, weights: np.ndarray) -> np.ndarray:
+    """Standard deviation in space (T,) of a part that the sequential fits state, metres.
+
+    Fingers have the errors of the smoothed hand, at which the joint fit starts, and of the wrist.
+    """
     if part == JudgedPart.OBJECT:
         return np.sqrt(3) * fits.object_sigma
-    return np.sqrt(3 * fits.joint_sigma**2 @ weights)
+    variance = fits.joint_sigma**2
+    hands = fits.hand_sigma**2 + variance[:, _WRISTS]
+    variance[:, BOTH_HANDS] = np.repeat(hands, 15, axis=1)
+    return np.sqrt(3 * variance @ weights)
 
 
 def _known(fits: SequentialFits, result: JointResult, part: JudgedPart) -> np.ndarray:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from bench import verdict as bench
+from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors, verdict_figures
 from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart, ViewErrors
+from intercap_core.evaluation.verdict.judge import start_sigma
 from intercap_core.evaluation.verdict.stated import CALIBRATION, estimate_error
+from intercap_core.joint.sequential import SequentialFits
 
 T = 4
 
@@ -48,6 +53,17 @@ def test_features_add_up_as_squares(part: JudgedPart, features: tuple[float, ...
     assert said.error == pytest.approx(expected)
     assert said.by_frame == pytest.approx(np.full(T, expected))
     assert said.factor == CALIBRATION[part].spread and said.silent == ""
+
+
+def test_fingers_have_the_errors_of_the_smoothed_hand_and_of_the_wrist() -> None:
+    """The body fit's own deviation of an unseen hand does not count: neighbours determine it."""
+    joints = np.full((T, 55), 0.035)
+    joints[:, [JOINT_INDEX["left_wrist"], JOINT_INDEX["right_wrist"]]] = [0.003, 0.012]
+    hands = np.tile([0.004, 0.005], (T, 1))
+    fits = cast(SequentialFits, SimpleNamespace(joint_sigma=joints, hand_sigma=hands))
+    fingers = np.where(np.arange(55) < FIRST_FINGER, 0, 1 / 30)
+    sigma = start_sigma(fits, JudgedPart.HANDS, fingers)
+    np.testing.assert_allclose(sigma, np.sqrt(3 * (0.005**2 + 0.013**2) / 2))
 
 
 def test_filled_frames_have_no_stated_error() -> None:
