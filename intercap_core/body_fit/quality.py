@@ -97,6 +97,10 @@ class PartEvidence(NamedTuple):
     """(N, 8) number of views in which a keypoint is an inlier, median over the keypoints."""
     measured_share: Tensor
     """(N, 8) share of the part's skin samples with depth points."""
+    excess: Tensor
+    """(N, 8) mean square residual of the part's detections over its assumed variance, weighted by
+    confidence, at least 1. Outliers count up to `KEYPOINT_SCALE`: views may agree on a wrong point,
+    and those that contradict it may be right."""
 
 
 def compare_parts(
@@ -118,7 +122,10 @@ def compare_parts(
     """
     size = (len(whitened), len(BODY_PARTS))
     unknown, none = whitened.new_full(size, torch.nan), whitened.new_zeros(size)
-    result = PartEvidence(unknown, unknown.clone(), none, none.clone(), none.clone())
+    result = PartEvidence(
+        unknown, unknown.clone(), none, none.clone(), none.clone(), none + 1
+    )  # fmt: skip
+    square = whitened.clamp(max=KEYPOINT_SCALE) ** 2 / 2
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):
         at = torch.isin(index, torch.as_tensor(_PARTS[part].keypoints))
@@ -131,12 +138,28 @@ def compare_parts(
         # a correct elbow does not imply a correct wrist
         result.outlier_share[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
+        mean_square = (weight * square[:, :, at]).sum((1, 2)) / weight.sum((1, 2))
+        result.excess[:, column] = mean_square.nan_to_num(nan=1.0).clamp_min(1.0)
         inliers = ((weight > 0) & good).sum(1)
         result.visible_share[:, column] = (inliers > 0).to(weight).mean(1)
         result.views[:, column] = inliers.to(weight).median(1).values
         if samples is not None:
             on_part = np.isin(samples[0], _PARTS[part].carriers)
             result.measured_share[:, column] = samples[1][:, on_part].to(weight).mean(1)
+    return result
+
+
+def joint_excess(evidence: PartEvidence) -> Tensor:
+    """Return the excess (N, 55) of each joint's part; that of the trunk for other joints.
+
+    A hand has at least the excess of its arm.
+    """
+    excess = dict(zip(BODY_PARTS, evidence.excess.unbind(1), strict=True))
+    result = excess["trunk"][:, None].repeat(1, len(JOINT_NAMES))
+    for part, own in excess.items():
+        side, _, limb = part.partition("_")
+        larger = torch.maximum(own, excess[f"{side}_arm"]) if limb == "hand" else own
+        result[:, _PARTS[part].joints] = larger[:, None]
     return result
 
 

@@ -83,9 +83,6 @@ class BodyFit:
     """The betas are shared."""
     shared_counts: Tensor
     """(m,) how many times the prior of each shared parameter counts in a frame."""
-    excess: Tensor
-    """(N,) ratio of the variance of the keypoints' residuals to the assumed one, estimated from
-    their median, >= 1."""
     pixel_residual: Tensor
     """(N, C) median error of the body keypoints, px, NaN = none detected."""
     cloud_residual: Tensor
@@ -243,7 +240,6 @@ class Fitter:
         evidence, views, index = self.evidence, problem.views, problem.keypoints.index
         residuals = evidence.pixel_residuals(problem)
         pixels = self._body_errors(problem, residuals)
-        whitened = pixels / views.sigma[:, :, BODY]
         return BodyFit(
             frames=self.frames,
             vectors=problem.base,
@@ -251,8 +247,6 @@ class Fitter:
             hessian=hessian,
             one_shape=problem.one_shape,
             shared_counts=problem.layout.prior(problem.base)[2],
-            # the median of a chi-squared variable with two degrees of freedom is 2 ln 2
-            excess=((whitened**2 / 2).flatten(1).nanmedian(1).values / np.log(2)).clamp_min(1.0),
             pixel_residual=pixels.nanmedian(2).values,
             cloud_residual=evidence.cloud_residual,
             settled=Settled(

@@ -9,6 +9,7 @@ from torch import Tensor
 from intercap_core.body.joints import NUM_JOINTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
+from intercap_core.body_fit.quality import joint_excess
 from intercap_core.body_fit.schedule import BodyFit
 
 # Error of a joint that ten shape components leave, metres along one coordinate: 1.3 mm in the mean
@@ -25,8 +26,9 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
         J_o H_oo^-1 J_o' e  +  G S^-1 G'  +  sigma_m^2 I,   G = J_s - J_o H_oo^-1 H_os
 
     The first term is the covariance if shape, offsets and coverings are known, scaled by the
-    ``excess`` e of the frame's residuals. The second is that of the shared parameters, with the
-    information S_ij = mean over frames of (H_ss - H_so H_oo^-1 H_os)_ij / sqrt(k_i k_j). k are the
+    excess e of the residuals of the joint's part (:func:`.quality.joint_excess`). The second is
+    that of the shared parameters, with the information S_ij = mean over frames of (H_ss - H_so
+    H_oo^-1 H_os)_ij / sqrt(k_i k_j). k are the
     counts of the shared priors (:meth:`.problem.ParameterLayout.prior`). Errors of shared
     parameters are the same in every frame, so a recording counts as 1 / k independent frames, not
     as its number of frames. sigma_m is the error of the body model.
@@ -40,6 +42,7 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     shared_factor = torch.linalg.cholesky(information)
     model_error = _MODEL_SIGMA_M**2 * torch.eye(3).to(information)
     result = information.new_zeros(len(fit.vectors), NUM_JOINTS, 3, 3)
+    excess = joint_excess(fit.parts).double()[..., None, None]
     for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
         # one vertex in place of all, which is dropped below, then the joints
         lin = model.linearise(
@@ -50,8 +53,7 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
         by_shared = -by_own @ answer
         if fit.one_shape:
             by_shared[..., : len(betas)] += full[..., betas]
-        excess = fit.excess[at, None, None, None].double()
-        own_error = _covariance(factor, by_own) * excess
+        own_error = _covariance(factor, by_own) * excess[at]
         result[at] = own_error + _covariance(shared_factor, by_shared) + model_error
     return result
 

@@ -62,6 +62,24 @@ def test_a_contradicted_hand_is_widened_by_its_distance(fine):
     assert _undetermined(evidence, widened) == ["right_hand"]
 
 
+def test_views_that_agree_on_another_wrist_widen_arm_and_hand(fine):
+    """Half of the views are 3 sigmas off: no outliers, and the median of all keypoints is small."""
+    whitened, confidence, _ = fine
+    whitened[:, :2, [KEYPOINT_NAMES.index(f"left_{name}") for name in ("elbow", "wrist")]] = 3.0
+    excess = quality.joint_excess(_evidence(whitened, confidence))[0]
+    for name in ("left_elbow", "left_wrist", "left_index1"):
+        assert excess[JOINT_INDEX[name]] == pytest.approx((3.0**2 + 0.7**2) / 4)
+    for name in ("right_wrist", "right_index1", "spine1", "left_knee", "head"):
+        assert excess[JOINT_INDEX[name]] == 1
+
+
+def test_one_wrong_view_of_four_counts_as_far_as_the_scale_of_outliers(fine):
+    whitened, confidence, _ = fine
+    whitened[:, 0, KEYPOINT_NAMES.index("left_wrist")] = 100.0
+    excess = quality.joint_excess(_evidence(whitened, confidence))[0, JOINT_INDEX["left_wrist"]]
+    assert excess == pytest.approx((quality.KEYPOINT_SCALE**2 + 7 * 0.7**2) / 16)
+
+
 def test_unseen_parts_are_undetermined_by_their_deviation(fine):
     whitened, confidence, sigma = fine
     confidence[:, :, 67:] = 0

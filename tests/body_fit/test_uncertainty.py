@@ -11,6 +11,7 @@ from intercap_core.body_fit.problem import columns_of
 from intercap_core.body_fit.quality import PartEvidence
 from intercap_core.body_fit.schedule import BodyFit, Settled
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
+from intercap_core.schemas import BODY_PARTS
 
 SHARED = 10 + 75 + 8
 MODEL_M = 0.001
@@ -24,10 +25,10 @@ def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> B
     hessian = 50 * (rows.transpose(1, 2) @ rows).double().expand(frames, -1, -1)
     vectors = model.zeros(frames).vector()
     nothing = torch.zeros(frames)
+    parts = PartEvidence(*[nothing] * 5, torch.full((frames, len(BODY_PARTS)), excess))
     return BodyFit(
         np.arange(frames), vectors, columns, hessian, True, torch.full((SHARED,), counts),
-        torch.full((frames,), excess), nothing, nothing,
-        Settled(*[nothing] * 5), PartEvidence(*[nothing] * 5), np.zeros(frames, bool),
+        nothing, nothing, Settled(*[nothing] * 5), parts, np.zeros(frames, bool),
     )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ The features are root mean square errors in space, in metres:
   that the detector makes in all views, since depth does not share them.
 - ``common``: standard deviation due to the covariance of cameras and depth biases that the joint
   fit states. These errors are the same in all frames.
-- ``sigma``: standard deviation of the poses at which the joint fit starts. It is large for limbs and
-  hands that no or one view supports.
+- ``sigma``: standard deviation of the poses at which the joint fit starts. It is large for limbs
+  and hands that no or one view supports.
 
 The object's error uses ``cameras`` and ``common`` alone: its tracked deviation and the displacement
 without depth did not improve the prediction of kinds of recordings that were left out.
