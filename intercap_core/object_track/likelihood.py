@@ -8,9 +8,9 @@ nats: the sum of
 - mask: either a candidate shows the object, by the distances of its outline from the render's and
   by its label; or the detector missed the object, which is less likely the more of it is visible.
 
-Pixels that a person hides are no evidence. Depth that equals the empty room is no evidence for the
-object outside of a candidate. Pixels of one view err together, so each term counts as at most
-``VIEW_SAMPLES`` independent samples.
+Pixels that a person or furniture hides are no evidence. Depth that equals the empty room is no
+evidence for the object outside of a candidate. Pixels of one view err together, so each term counts
+as at most ``VIEW_SAMPLES`` independent samples.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _depth(
         geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
         person.mask, person.x0, person.y0, mask.mask, mask.x0, mask.y0,
-        likely_sigma_m, background_m, clutter_m, log_past, log_hidden,
+        likely_sigma_m, background_m, clutter_m, log_past, log_hidden, mesh.diameter,
     )  # fmt: skip
     return VIEW_SAMPLES * total / (count + DEPTH_HALF_SAMPLES_PX)
 
@@ -127,15 +127,16 @@ def _mask(
 def depth_log_ratio(
     rendered, face, x0, y0, measured, background, rays, face_normals, rotation,
     colour_from_depth, colour, person, px, py, mask, mx, my,
-    sigma, background_m, clutter_m, log_past, log_hidden,
+    sigma, background_m, clutter_m, log_past, log_hidden, diameter,
 ):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
 
     Without the object, depth is uniform over ``clutter_m``. With it, a pixel shows the surface, by
     a Gaussian of ``sigma`` along its normal. If that is less likely, it shows background behind the
     surface (``log_past``) or an occluder (``log_hidden``). Pixels outside of the mask that a person
-    explains are no evidence. Pixels outside of the mask that the background explains are no
-    evidence for the object, since a flat object fits any floor.
+    explains are no evidence. Neither are those that show the empty room: a flat object fits any
+    floor, and furniture may hide the object. Only if the room's surface is less than a diameter in
+    front of the object, it contradicts the pose, because the object does not lie in the floor.
 
     Args:
         rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the depth image.
@@ -149,6 +150,7 @@ def depth_log_ratio(
         background_m: largest difference from the empty room at which depth shows the room, metres.
         clutter_m: range in which other surfaces are measured uniformly, metres.
         log_past, log_hidden: least values of a pixel, of background and of occlusion.
+        diameter: of the object, metres.
 
     Returns:
         The sum, and the number of pixels with a measurement.
@@ -179,7 +181,8 @@ def depth_log_ratio(
                 total += max(shown, log_hidden)
             elif not covers(person, x - px, y - py):
                 known = background[y0 + v, x0 + u] if background.size else np.float32(0.0)
-                if shown < 0 or known <= 0 or abs(known - z) > background_m:
+                is_room = known > 0 and abs(known - z) <= background_m
+                if not is_room or (shown < 0 and gap > -diameter):
                     total += max(shown, log_hidden)
     return total, count
 

@@ -116,7 +116,8 @@ class Proposals:
         for t, k in enumerate(decoded.path):
             weight[t] = 0.0 if k == HIDDEN else self._prior.weigh(t, fits[t])[k]
             probability[t] = decoded.probability[t][k]
-        usual = float(np.median(weight[weight > 0])) if (weight > 0).any() else 0.0
+        # if the object is hidden in all frames, no weight is usual, and every frame is uncertain
+        usual = float(np.median(weight[weight > 0])) if (weight > 0).any() else np.inf
         poor = 0.5 * usual
         doubtful = (weight < poor) | (probability < DOUBTFUL_PROBABILITY) | hidden
         sure = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubtful)}

@@ -148,8 +148,22 @@ def test_depth_of_the_empty_room_is_no_evidence_outside_masks(unlabelled, captur
     assert ratios(unlabelled, in_mask, pose)[0] > 0.9 * ratios(unlabelled, views, pose)[0]
     before_wall = [replace(view, background=view.depth + np.float32(0.5)) for view in unseen]
     assert ratios(unlabelled, before_wall, pose)[0] == pytest.approx(fits)
-    aside = moved(pose[0], 0.6)[None]
-    assert ratios(unlabelled, room, aside)[0] <= ratios(unlabelled, unseen, aside)[0] + 1e-9
+
+
+@pytest.mark.parametrize(("ahead_m", "is_room"), [(1.5, True), (0.3, True), (1.5, False)])
+def test_only_furniture_more_than_a_diameter_ahead_may_hide_the_object(
+    unlabelled, capture, views, ahead_m, is_room
+):
+    pose, diameter = capture.poses[0], capture.mesh.diameter
+    assert 0.3 < diameter < 1.0
+    hidden = []
+    for view in views:
+        centre = view.geometry.camera.depth_from_master @ [*capture.mesh.centre_at(pose), 1]
+        depth = np.full_like(view.depth, centre[2] - ahead_m)
+        background = depth if is_room else view.background
+        hidden.append(replace(view, depth=depth, background=background, candidates=()))
+    ratio = ratios(unlabelled, hidden, pose[None])[0]
+    assert ratio == pytest.approx(0, abs=0.1) if is_room and ahead_m > diameter else ratio < -10
 
 
 def test_a_missed_object_costs_the_detectors_miss_rate(unlabelled, capture, views):
