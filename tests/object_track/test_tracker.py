@@ -12,7 +12,11 @@ from intercap_core import artefacts
 from intercap_core.annotation import ObjectPose
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import step_between
+from intercap_core.object_track.decoder import HIDDEN, Decoded
 from intercap_core.object_track.fit import FittedPose
+from intercap_core.object_track.hypotheses import Hypotheses, Prior
+from intercap_core.object_track.proposals import Proposals
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.whole import FrameResult
 from intercap_core.schemas import OBJECT_TRACK
@@ -25,6 +29,7 @@ from tests.object_track.scenes import (
     frames_with,
     images_of,
     mesh_of,
+    observer_of,
     track_of,
 )
 
@@ -42,6 +47,23 @@ def test_it_is_tracked_through_misses_and_an_absence(suitcase):
     assert shift.max() < 0.003 and turn.max() < 1
     place = [np.trace(frame.fit.covariance[3:, 3:]) for frame in track.frames]
     assert place[7] > 10 * place[5]
+
+
+def test_frames_are_searched_if_the_object_is_hidden_in_all(suitcase, capture, images):
+    """The first frames that were searched may have shown nothing of it."""
+    observer = observer_of(capture, images)
+    observer.places.claim(suitcase.centre_at(capture.poses[0]))
+    prior = Prior(observer)
+    hypotheses = Hypotheses(observer, prior)
+    count = len(images)
+    nothing = Decoded(np.full(count, HIDDEN), [np.ones(1)] * count, np.zeros(count), 0.0)
+    assert Proposals(observer, hypotheses, prior).search_uncertain(nothing)
+    shift, turn = min(
+        np.abs(step_between(fit.pose, pose)).reshape(2, 3).max(1)[::-1].tolist()
+        for fits, pose in zip(hypotheses.fits, capture.poses, strict=True)
+        for fit in fits
+    )
+    assert shift < 0.003 and turn < np.radians(1)
 
 
 def test_known_exposure_offsets_reduce_the_errors(suitcase):

@@ -101,7 +101,7 @@ def evaluate(
     duration = (time.monotonic() - begin) / 60
     print_minutes(list(projects), minutes, duration)
     figures["constants.total"] = total_constants()
-    print(f"constants of the package: {figures['constants.total']} (557 at 6a7f266a)")
+    print(f"constants of the package: {figures['constants.total']}")
     figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
     flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
     output.parent.mkdir(parents=True, exist_ok=True)
