@@ -12,13 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.fit import (
-    CONTOUR_SCALES_PX,
-    DEPTH_SCALES_M,
-    view_fits,
-)
+from intercap_core.object_track.fit import DEPTH_SCALES_M, view_fits
 from intercap_core.object_track.view import FitContext, View
-from intercap_core.object_track.view_fit import NormalEquations, ViewFit
+from intercap_core.object_track.view_fit import CONTOUR_SCALES_PX, NormalEquations, ViewFit
 from intercap_core.object_track.view_report import ViewReport
 
 # Total variance of the views' errors over the part that is independent between views. Errors that

@@ -14,13 +14,17 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.geometry.rigid.shots import Rendering, Surface
 from intercap_core.object_track.view import FitContext, View
-from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
+from intercap_core.object_track.view_fit import (
+    CONTOUR_SCALES_PX,
+    NormalEquations,
+    ViewFit,
+    shots_of,
+)
 from intercap_core.object_track.view_report import ViewReport, quick_report
 
-# Geman-McClure scales, first and last: from the error of a start to a few standard deviations of
-# the noise.
+# Geman-McClure scales, first and last, like those of contours: from the error of a start to a few
+# standard deviations of the noise.
 DEPTH_SCALES_M = (0.050, 0.012)  # metres; tuned
-CONTOUR_SCALES_PX = (30.0, 6.0)  # pixels at full resolution; tuned
 FIT_ROUNDS = (4, 5)  # at most this many Gauss-Newton steps after each choice of candidates; tuned
 
 

@@ -43,6 +43,8 @@ CONTOUR_SAMPLES = 3.0  # independent samples of a view's silhouette term; tuned
 # Kinect's data sheet states a systematic error below 11 mm + 0.1 % of the distance; half of that
 # bound is a guess of its standard deviation.
 DEPTH_SIGMA_M = 0.005  # metres; data sheet
+# Geman-McClure scales of contours, first and last of a fit.
+CONTOUR_SCALES_PX = (30.0, 6.0)  # pixels at full resolution; tuned
 GATE_SCALES = 2.5  # robust scales; matches beyond weigh below 2 % and are left out (tuned)
 
 NormalEquations = tuple[np.ndarray, np.ndarray]
@@ -180,8 +182,8 @@ class ViewFit:
         overlap = contour = float("nan")
         if self._candidate is not None:
             overlap = mask_overlap(image, self._candidate.mask, view.person)
-            # px at full resolution: four times the last scale of a fit, so that outliers count
-            _, _, residuals = self.contour_terms(24.0, True)
+            # four times the last scale of a fit, so that outliers count
+            _, _, residuals = self.contour_terms(4 * CONTOUR_SCALES_PX[1], True)
             contour = float(np.median(residuals)) * view.geometry.step if len(residuals) else 0.0
         visible = visible_pixels(image, view.person)
         depth_residual = agreement = float("nan")
