@@ -15,7 +15,8 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import class_names
-from intercap_core.formats.recordings.layouts import open_layout
+from intercap_core.formats.recordings.extract import advice_on_size
+from intercap_core.formats.recordings.layouts import list_unread, open_layout
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
 from intercap_core.project import Project
 from intercap_core.schemas import TRUTH
@@ -71,13 +72,14 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
         faults.insert(0, f"column recordings names {row.recordings}, which is not a folder")
     if not row.recordings.is_dir() or not row.calibration.exists():
         return RecordingFindings(faults=faults)
+    unread = list_unread(row)
     try:
         layout = open_layout(row)
     except UserError as error:
-        return RecordingFindings(faults=[*faults, str(error)])
+        return RecordingFindings(faults=[*faults, str(error)], notes=unread)
     if not layout.names:
         faults.append(f"{row.recordings} contains no recording in the layout {row.layout}")
-        return RecordingFindings(faults=faults)
+        return RecordingFindings(faults=faults, notes=unread)
     settings = project.config.frames
     known = list(layout.extrinsics.master_from_colour)
     faults += [
@@ -94,6 +96,7 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
     posed = [name for name in used if name in known]
     findings = check_recordings(row, layout, posed, without_depth=not settings.depth)
     findings.faults[:0] = faults
+    findings.notes[:0] = unread
     absent = [name for name in known if name not in layout.names]
     if absent:
         findings.notes.append(
@@ -201,6 +204,10 @@ def check_recordings(
                     recording.truncated,
                     recording.preview(),
                 )
+                findings.notes += [
+                    f"{recording.source}: camera {name}: {note}"
+                    for note in (*recording.notes, *recordings[name].preview.remarks)
+                ]
         except UserError as error:
             findings.faults.append(str(error))
         except OSError as error:
@@ -252,7 +259,7 @@ def _check_recording(
         findings.faults.append(
             f"{source}: camera {name}'s images are {preview.size[0]}x{preview.size[1]}, "
             f"{row.calibration} is for {recording.size[0]}x{recording.size[1]}, so the camera "
-            "would be left out; give the calibration of this resolution"
+            f"would be left out; {advice_on_size(preview.size, recording.size)}"
         )
     findings.notes += [
         f"{source}: camera {name} {fault}; copy it again" for fault in preview.faults

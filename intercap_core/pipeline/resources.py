@@ -54,7 +54,7 @@ def extent_of(project: Project, sequence: str) -> Extent:
 def recorded_mb(recordings: Path) -> float:
     """Megabytes of the recordings' MKV files; 0 for folders of images, which take minutes to add
     up for hundreds of sequences."""
-    files = recordings.glob("*.mkv") if recordings.is_dir() else ()
+    files = recordings.glob("*.[mM][kK][vV]") if recordings.is_dir() else ()
     return sum(path.stat().st_size for path in files) / 1e6
 
 

@@ -161,7 +161,7 @@ def _read_images(folder: Path) -> Any:
             if name == "depth.png":
                 within(0, 2**16, read_depth(folder / name, SIZE))
             else:
-                within(0, 2**32, encoded_size(read_colour(folder / name)))
+                within(0, 2**32, encoded_size(read_colour(folder / name)[0]))
         except DamagedImage as error:
             notes.append(f"{name} {error}")
     return notes

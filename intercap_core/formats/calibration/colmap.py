@@ -101,7 +101,9 @@ def _read(folder: Path, recorded: RecordedCameras, scale: float | None) -> Calib
         posed.append((image.name, lenses[image.camera], _pose(image, images_file)))
     cameras = group_images_by_camera(folder, posed, recorded, scale=scale)
     unit = "its reconstruction is known but for its size"
-    return to_calibration(folder, "COLMAP", cameras, recorded, scale=scale, unit=unit)
+    return to_calibration(
+        folder, "COLMAP", cameras, recorded, scale=scale, unit=unit, as_stored=True
+    )
 
 
 READER = CalibrationReader(

@@ -125,6 +125,7 @@ def to_calibration(
     *,
     scale: float | None,
     unit: str | None,
+    as_stored: bool = False,
 ) -> Calibration:
     """Name the cameras as the recordings do and scale them to metres; the first is the master.
 
@@ -139,6 +140,7 @@ def to_calibration(
         scale: metres for one unit of the file, as the user states it.
         unit: why the file's unit of length is unknown, as a clause for the message; None if the
             file is in metres.
+        as_stored: whether the tool leaves the Exif orientation of image files aside.
     """
     if not cameras:
         raise UserError(f"{path}: holds no camera; calibrate again, or name another file")
@@ -159,7 +161,7 @@ def to_calibration(
         pose = camera.camera_from_world.copy()
         pose[:3, 3] *= scale or 1.0
         poses[name] = invert(pose)
-        calibrated[name] = CalibratedCamera(camera.lens)
+        calibrated[name] = CalibratedCamera(camera.lens, as_stored=as_stored)
     if recorded.names and not set(poses) & set(recorded.names):
         raise UserError(
             f"{path}: its cameras are {list_names(poses)}, the recordings are of "

@@ -51,6 +51,10 @@ class CalibratedCamera:
     """Images a second; None = not stated."""
     time_offset: float = 0.0
     """Seconds that are added to the times of all images."""
+    depth_unit_m: float = 0.001
+    """Metres for one unit of the depth files."""
+    as_stored: bool = False
+    """Whether lens and pose are those of image files as stored, without their Exif orientation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
             f"{path}: master {quoted(master)} is none of the cameras ({list_names(entries)}); "
             "correct the name or add the camera"
         )
-    fps = _rate(content, f"{path}")
+    fps, unit = _rate(content, f"{path}"), _depth_unit(content, f"{path}")
     cameras, poses = {}, {}
     for name, entry in entries.items():
         where = f"{path}: camera {quoted(name)}"
@@ -95,7 +99,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
                 f"{where}: expected a name of letters, digits, '_' and '-', and fields such as "
                 "camera_matrix; correct it"
             )
-        cameras[name] = _camera(entry, where, fps)
+        cameras[name] = _camera(entry, where, fps, unit)
         poses[name] = _pose(entry, where, path, is_master=name == master)
     return Calibration(cameras, relate_to_master(path, master, poses))
 
@@ -299,8 +303,11 @@ def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
     return rigid(r, t)
 
 
-def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
-    """Read all of a camera's entry but its pose; ``fps`` is the rate stated for all cameras."""
+def _camera(entry: dict[str, Any], where: str, fps: float | None, unit: float) -> CalibratedCamera:
+    """Read all of a camera's entry but its pose.
+
+    ``fps`` and ``unit`` are the rate and the unit of depth, metres, stated for all cameras.
+    """
     colour = _lens(entry, where)
     offset = parse_number(entry.get("time_offset", 0.0), where, "time_offset", "seconds")
     if abs(offset) > 1e9:  # clocks that count from 1970 are above it
@@ -329,7 +336,19 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
             f"{where}: depth is {quoted(depth, 40)}, expected 'aligned' or a lens with "
             "colour_from_depth; correct it"
         )
-    return CalibratedCamera(colour, lens, colour_from_depth, _rate(entry, where) or fps, offset)
+    fps, unit = _rate(entry, where) or fps, _depth_unit(entry, where, unit)
+    return CalibratedCamera(colour, lens, colour_from_depth, fps, offset, unit)
+
+
+def _depth_unit(entry: dict[str, Any], where: str, unit: float = 0.001) -> float:
+    """Metres for one unit of the depth files; ``unit`` if the entry does not state it."""
+    value = parse_number(entry.get("depth_unit", unit), where, "depth_unit", "metres")
+    if not 1e-6 <= value <= 0.1:  # 16 bits then reach 6.5 cm, or have steps of 10 cm
+        raise UserError(
+            f"{where}: depth_unit is {value:.4g}, expected metres for one unit of the depth files "
+            "(0.001 = millimetres, 0.0002 = 1/5000 m); correct it"
+        )
+    return value
 
 
 def _lens(entry: dict[str, Any], where: str) -> Intrinsics:

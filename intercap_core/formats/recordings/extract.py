@@ -15,13 +15,23 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.image_files import encoded_size
+from intercap_core.formats.recordings.encodings import encoded_size
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout, Sound
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import printable
 from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
+
+
+def advice_on_size(actual: tuple[int, ...], expected: tuple[int, ...]) -> str:
+    """Next step for images whose size (width, height) is not that of the calibration."""
+    if actual == expected[::-1]:
+        return (
+            "give the calibration of the images as shown: an orientation that the files state "
+            "(exiftool -Orientation FILES) turns them"
+        )
+    return "give the calibration of this resolution"
 
 
 @dataclass
@@ -196,8 +206,8 @@ class _Copy:
         if first:
             raise UserError(
                 f"{self.recording.source}: {kind} images are {actual[0]}x{actual[1]}, the "
-                f"calibration of camera {self.view.name} is for {expected[0]}x{expected[1]}; give "
-                "the calibration of this resolution"
+                f"calibration of camera {self.view.name} is for {expected[0]}x{expected[1]}; "
+                f"{advice_on_size(actual, expected)}"
             )
         self.other_size += 1
 

@@ -34,7 +34,7 @@ from intercap_core.formats.calibration.k4a import (
     read_calibration,
 )
 from intercap_core.formats.calibration.opencv import check_rate
-from intercap_core.formats.recordings import image_files, video
+from intercap_core.formats.recordings import encodings, video
 from intercap_core.formats.recordings.source import (
     CameraRecording,
     ClosedOnExit,
@@ -70,7 +70,7 @@ class KinectFileInfo:
     colour_mode: str
     """Key of ``COLOUR_MODES``."""
     colour_format: str
-    """MJPG or one of :data:`.image_files.RAW_FORMATS`."""
+    """MJPG or one of :data:`.encodings.RAW_FORMATS`."""
     depth_mode: str | None
     """Key of ``DEPTH_MODES``; None without depth."""
     fps: float
@@ -149,11 +149,11 @@ class KinectFile(ClosedOnExit):
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
         """Whether a packet holds one complete image, or inertial samples."""
         if kind == "colour" and self.info.colour_format == "MJPG":
-            return image_files.encoded_size(content) is not None
+            return encodings.encoded_size(content) is not None
         if kind == "colour":
             width, height = COLOUR_MODES[self.info.colour_mode].size
             return len(content) == round(
-                width * height * image_files.RAW_FORMATS[self.info.colour_format]
+                width * height * encodings.RAW_FORMATS[self.info.colour_format]
             )
         if kind == "depth" and self.info.depth_mode is not None:
             width, height = DEPTH_MODES[self.info.depth_mode].size
@@ -237,11 +237,11 @@ class KinectFile(ClosedOnExit):
         four_cc = colour.codec_context.codec_tag.upper()
         if colour.codec_context.name == "mjpeg":
             return "MJPG"
-        if four_cc in image_files.RAW_FORMATS:
+        if four_cc in encodings.RAW_FORMATS:
             return four_cc
         raise UserError(
             f"{self.path}: colour is recorded as {four_cc or colour.codec_context.name}, expected "
-            f"MJPG, {', '.join(image_files.RAW_FORMATS)}; record in a colour mode of k4arecorder"
+            f"MJPG, {', '.join(encodings.RAW_FORMATS)}; record in a colour mode of k4arecorder"
         )
 
     def _depth_mode(self, depth: Any) -> str | None:
@@ -317,14 +317,24 @@ def _is_truncated(path: Path) -> bool:
 
 
 class KinectLayout(RecordingLayout):
-    """Files ``<camera>.mkv``; poses of :func:`read_extrinsics` or of another tool's calibration.
+    """Files ``<camera>.mkv``, in capitals too.
 
-    Lenses are those in the recordings.
+    Poses are those of :func:`read_extrinsics` or of another tool's calibration. Lenses are those in
+    the recordings.
     """
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
-        self.names = sorted(path.stem for path in sequence.recordings.glob("[!.]*.mkv"))
+        self._paths: dict[str, Path] = {}
+        for file in sorted(sequence.recordings.iterdir()):
+            if file.suffix.lower() == ".mkv" and not file.name.startswith("."):
+                other = self._paths.setdefault(file.stem, file)
+                if other != file:
+                    raise UserError(
+                        f"{sequence.recordings}: camera {file.stem} is recorded as {other.name} "
+                        f"and {file.name}; keep one"
+                    )
+        self.names = list(self._paths)
         path, scale = sequence.calibration, sequence.calibration_scale
         other = read_tool_calibration(path, RecordedCameras(self.names), scale)
         if other is None:
@@ -333,8 +343,7 @@ class KinectLayout(RecordingLayout):
 
     def open(self, name: str) -> KinectRecording:
         """Open ``<name>.mkv``; raises UserError as :class:`KinectFile` does."""
-        path = self.sequence.recordings / f"{name}.mkv"
-        return KinectRecording(path, name, self.extrinsics.master_from_colour[name])
+        return KinectRecording(self._paths[name], name, self.extrinsics.master_from_colour[name])
 
 
 class KinectRecording(CameraRecording):
@@ -381,14 +390,14 @@ class KinectRecording(CameraRecording):
                 content = self._recording.depth_image(packet.content)
             elif info.colour_format != "MJPG":
                 size = COLOUR_MODES[info.colour_mode].size
-                content = image_files.encode_jpeg(
-                    image_files.decode_raw(packet.content, info.colour_format, size)
+                content = encodings.encode_jpeg(
+                    encodings.decode_raw(packet.content, info.colour_format, size)
                 )
             yield Image(packet.kind, packet.device_time_us, content)
         if info.colour_format != "MJPG":
             self.notes.append(
                 f"colour was recorded as {info.colour_format} and is stored as JPEG of quality "
-                f"{image_files.JPEG_QUALITY}"
+                f"{encodings.JPEG_QUALITY}"
             )
         if self.truncated:
             self.notes.append(

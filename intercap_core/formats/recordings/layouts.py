@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 
 from intercap_core.config_types import LayoutName
@@ -9,18 +11,87 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout
+from intercap_core.inputs.files import printable
 
 # Patterns of the files and folders that the workflow watches, below the folder of recordings ("" =
 # that folder). A folder's time changes if an image is added or removed; watching each of the
 # thousands of images would delay every run by minutes.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
-    "k4a": ("*.mkv",),
+    "k4a": ("*.[mM][kK][vV]",),
     "intercap": ("Frames_Cam*/*",),
     "behave": ("",),
-    "plain": ("*", "*/colour", "*/depth"),
+    "plain": (
+        "*",
+        "*/[cC][oO][lL][oO][rR]",
+        "*/[cC][oO][lL][oO][uU][rR]",
+        "*/[rR][gG][bB]",
+        "*/[dD][eE][pP][tT][hH]",
+    ),
 }
 # Suffixes of other files in such a folder, such as the studio's truth.
 _NO_RECORDINGS = {".h5", ".json", ".yaml", ".yml", ".toml", ".txt", ".tsv", ".part"}
+_DEEPEST = 3  # levels of folders below the recordings that are looked at
+# Paths below the folder of recordings that the layouts read, and their description. A folder whose
+# path with "/" matches is read as a whole.
+_READ: dict[LayoutName, tuple[str, str]] = {
+    "k4a": (r"[^/]+\.mkv", "<camera>.mkv"),
+    "intercap": (
+        r"frames_cam\d{1,2}/(colou?r/\D*\d{1,9}\.(jpe?g|png)|depth[^/]*/\D*\d{1,9}\.png)",
+        "Frames_Cam<n>/color/<number>.jpg (or .png) and depth/<number>.png",
+    ),
+    "behave": (r"t\d{1,6}(\.\d{1,6})?/", "t<seconds>/k<n>.color.jpg and k<n>.depth.png"),
+    "plain": (
+        r"{camera}(?-i:_timestamps)\.(csv|txt)|{camera}(?-i:/timestamps)\.(csv|txt)|{camera}\.{video}|"
+        r"{camera}/((colou?r|rgb)/)?[^/]+\.(jpe?g|png|bmp|tiff?)|{camera}/depth/[^/]+\.(png|tiff?)",
+        "<camera>.mp4 (.mov, .mkv, .avi, ...), or <camera>/ with .jpg, .png, .bmp or .tif, and "
+        "<camera>/depth/ with 16-bit .png or .tif; a camera's name has letters, digits, '_' and "
+        "'-' alone",
+    ),
+}
+
+
+def list_unread(sequence: SequenceEntry) -> list[str]:
+    """Notes on files in the folder of recordings that the layout does not read.
+
+    Files with suffixes of text and data, and hidden ones, are left out.
+    """
+    pattern, expected = _READ[sequence.layout]
+    video = "(mp4|m4v|mov|mkv|webm|avi|mpe?g|ts|mts)"
+    pattern = pattern.replace("{camera}", "[A-Za-z0-9_-]+").replace("{video}", video)
+    is_read = re.compile(pattern, re.IGNORECASE)
+    unread: dict[tuple[str, str], list[str]] = {}
+    for folder, below, names in os.walk(sequence.recordings, followlinks=True):
+        relative = Path(folder).relative_to(sequence.recordings)
+        place = "" if relative == Path() else f"{relative.as_posix()}/"
+        below[:] = [
+            name
+            for name in sorted(below)
+            if not name.startswith(".")
+            and len(relative.parts) < _DEEPEST
+            and not is_read.fullmatch(f"{place}{name}/")
+        ]
+        for name in sorted(names):
+            suffix = Path(name).suffix
+            if (
+                not name.startswith(".")
+                and suffix.lower() not in _NO_RECORDINGS
+                and not is_read.fullmatch(f"{place}{name}")
+            ):
+                unread.setdefault((place, suffix), []).append(name)
+    notes = [
+        f"{sequence.recordings}: nothing reads {place}{names[0]}"
+        + (f" and {len(names) - 1} more of {place}*{suffix}" if len(names) > 1 else "")
+        for (place, suffix), names in unread.items()
+    ]
+    most = 4  # kinds that are named
+    if len(notes) > most:
+        notes[most:] = [f"{sequence.recordings}: nothing reads {len(notes) - most} other kinds"]
+    return [
+        printable(
+            f"{note}; layout {sequence.layout} reads {expected}; rename, move or convert them"
+        )
+        for note in notes
+    ]
 
 
 def input_files(sequence: SequenceEntry) -> list[Path]:

@@ -1,12 +1,14 @@
 """Layout ``plain``: a folder of images or a video for each camera, and a calibration file.
 
-``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or a video
-``<camera>.mp4``. ``<camera>/depth/`` holds the depth, if any: 16-bit PNG files, millimetres.
+``recordings`` holds ``<camera>/`` with JPEG, PNG, BMP or TIFF files (or ``<camera>/colour/``), or a
+video ``<camera>.mp4``. ``<camera>/depth/`` holds the depth, if any: 16-bit PNG or TIFF files,
+millimetres unless the calibration states ``depth_unit``. Suffixes and folders may be in capitals.
 ``calibration`` is any form of :mod:`intercap_core.formats.calibration.files`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,8 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
-from intercap_core.formats.recordings.image_files import FilesRecording, find_size
+from intercap_core.formats.calibration.opencv import CalibratedCamera
+from intercap_core.formats.recordings.image_files import Decoding, FilesRecording, find_size
 from intercap_core.formats.recordings.source import CameraRecording, RecordingLayout
 from intercap_core.formats.recordings.timestamps import (
     find_timestamps,
@@ -25,7 +28,8 @@ from intercap_core.formats.recordings.timestamps import (
 )
 from intercap_core.geometry.camera.rig import Camera
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts")
 COLOUR_FOLDERS = ("colour", "color", "rgb")
 
@@ -36,7 +40,8 @@ class PlainLayout(RecordingLayout):
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
         below = sorted(sequence.recordings.iterdir())
-        self._folders = {p.name: p for p in below if p.is_dir() and (_colour(p) or _depth(p))}
+        folders = [_CameraFolder.of(path) for path in below if path.is_dir()]
+        self._folders = {f.path.name: f for f in folders if f.colour or f.depth}
         self._videos = [p for p in below if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()]
         recorded = sorted({*self._folders, *(path.stem for path in self._videos)})
         self.names = [name for name in recorded if CAMERA_NAME.fullmatch(name)]
@@ -49,10 +54,10 @@ class PlainLayout(RecordingLayout):
 
     def _size_of(self, name: str) -> tuple[int, int] | None:
         """Width and height of the camera's first image; None if none can be read."""
-        folder = self._folders.get(name)
-        files = _colour(folder) if folder else []
-        if files:
-            return find_size(files[:1])
+        if name in self._folders and self._folders[name].colour:
+            return find_size(
+                self._folders[name].colour[:1]
+            )  # turned by Exif, as tools that state no size do
         from intercap_core.formats.recordings.video import read_video_size
 
         return next((read_video_size(path) for path in self._videos if path.stem == name), None)
@@ -63,14 +68,14 @@ class PlainLayout(RecordingLayout):
         Raises UserError if it has neither or several, and if the times of images are unknown.
         """
         known, folder = self._known[name], self._folders.get(name)
-        colour, depth = (_colour(folder), _depth(folder)) if folder else ([], [])
+        colour, depth = (folder.colour, folder.depth) if folder else ([], [])
         videos = [path for path in self._videos if path.stem == name]
         recorded = [path.name for path in videos] + [f"{name}/"] * bool(colour)
         if len(recorded) != 1:
             description = f"as {' and '.join(recorded)}" if recorded else "depth alone"
             raise UserError(
                 f"{self.sequence.recordings}: camera {name} is recorded {description}, expected "
-                "one video or one folder of .jpg or .png; keep or add one"
+                f"one video or one folder of {', '.join(IMAGE_SUFFIXES)}; keep or add one"
             )
         with_depth = bool(depth) and known.depth is not None
         camera = Camera(
@@ -80,11 +85,11 @@ class PlainLayout(RecordingLayout):
             known.colour_from_depth if with_depth else None,
             self.extrinsics.master_from_colour[name],
         )
-        source = videos[0] if videos else folder
-        assert source is not None
+        source = videos[0] if videos else self.sequence.recordings / name
         stem = source.with_name(f"{name}_timestamps") if videos else source / "timestamps"
         file = find_timestamps(stem)
         times = read_timestamps(file) if file else None
+        decoding = Decoding("ignore" if known.as_stored else "turn", known.depth_unit_m)
         recording: CameraRecording
         if videos:
             from intercap_core.formats.recordings.video import VideoRecording
@@ -96,6 +101,7 @@ class PlainLayout(RecordingLayout):
                 fps=known.fps,
                 offset_s=known.time_offset,
                 times=times,
+                decoding=decoding,
             )
         else:
             shots = pair_images(
@@ -108,30 +114,62 @@ class PlainLayout(RecordingLayout):
             )
             stated = np.array([shot.time_us for shot in shots if shot.colour])
             recording = FilesRecording(
-                source, camera, shots, known.fps or frame_rate(stated) or 1.0
+                source, camera, shots, known.fps or frame_rate(stated) or 1.0, decoding
             )
-        if depth and not with_depth:
+        recording.notes += folder.notes(known) if folder else []
+        if known.depth is not None and not depth:
             recording.notes.append(
-                "its depth images are not read: the calibration has no entry 'depth' (aligned, or "
-                "a lens)"
+                "the calibration states its depth, but it has no depth files; expected "
+                f"{name}/depth/ with 16-bit {', '.join(DEPTH_SUFFIXES)}"
             )
         return recording
 
 
 def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    if not folder.is_dir():
-        return []
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
     return sorted(path for path in visible if path.suffix.lower() in suffixes)
 
 
-def _colour(folder: Path) -> list[Path]:
-    """The camera's colour files, in its folder or in a folder of their own."""
-    in_folders = [
-        files for name in COLOUR_FOLDERS if (files := _images(folder / name, IMAGE_SUFFIXES))
-    ]
-    return in_folders[0] if in_folders else _images(folder, IMAGE_SUFFIXES)
+@dataclass(frozen=True)
+class _CameraFolder:
+    """The image files of a camera's folder."""
 
+    path: Path
+    colour: list[Path]
+    depth: list[Path]
+    unused: list[Path]
+    """Further folders with colour or depth images, which are not read."""
 
-def _depth(folder: Path) -> list[Path]:
-    return _images(folder / "depth", (".png",))
+    @classmethod
+    def of(cls, path: Path) -> _CameraFolder:
+        """Find the folders of colour and depth by their names in any case."""
+        below = sorted(entry for entry in path.iterdir() if entry.is_dir())
+        colour_folders = [
+            *(entry for name in COLOUR_FOLDERS for entry in below if entry.name.lower() == name),
+            path,
+        ]
+        depth_folders = [entry for entry in below if entry.name.lower() == "depth"]
+        used: list[list[Path]] = []
+        unused: list[Path] = []
+        for folders, suffixes in (
+            (colour_folders, IMAGE_SUFFIXES),
+            (depth_folders, DEPTH_SUFFIXES),
+        ):
+            holding = {entry: files for entry in folders if (files := _images(entry, suffixes))}
+            used.append(next(iter(holding.values()), []))
+            unused += list(holding)[1:]
+        return cls(path, *used, unused)
+
+    def notes(self, known: CalibratedCamera) -> list[str]:
+        """Notes on files that are not read, and on depth that is stated but absent."""
+        notes = [
+            f"the images in {self.path.name if entry == self.path else entry.name}/ are not read, "
+            "because another folder has its images; keep one of them"
+            for entry in self.unused
+        ]
+        if self.depth and known.depth is None:
+            notes.append(
+                "its depth images are not read: the calibration has no entry 'depth' (aligned, or "
+                "a lens)"
+            )
+        return notes

@@ -36,6 +36,8 @@ class RecordingPreview(NamedTuple):
     """Share of the stated content that the file holds."""
     faults: tuple[str, ...] = ()
     """Other faults; each follows the camera's name in a message."""
+    remarks: tuple[str, ...] = ()
+    """What is changed when images are stored; the same form."""
     counted: bool = True
     """Whether images were counted; otherwise they follow from duration and rate."""
 
@@ -59,8 +61,8 @@ class Image(NamedTuple):
     """Device time of the camera, microseconds. A depth image's time includes its delay by design
     (``CameraRecording.depth_delay_us``)."""
     content: bytes | np.ndarray
-    """Colour: a whole JPEG or PNG file. Depth: (H, W) uint16 in the size of the depth lens, mm,
-    0 = invalid."""
+    """Colour: a whole JPEG or PNG file without an orientation. Depth: (H, W) uint16 in the size of
+    the depth lens, mm, 0 = invalid."""
 
 
 class ClosedOnExit(AbstractContextManager[Any]):

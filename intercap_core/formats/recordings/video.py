@@ -8,20 +8,28 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.opencv import check_rate
-from intercap_core.formats.recordings.image_files import (
+from intercap_core.formats.recordings.encodings import (
     JPEG_QUALITY,
+    DamagedImage,
     encode_jpeg,
     encoded_size,
+    store_colour,
+    turn,
+)
+from intercap_core.formats.recordings.image_files import (
+    Decoding,
     inspect_files,
+    list_remarks,
     read_pairs,
 )
 from intercap_core.formats.recordings.source import (
@@ -39,6 +47,12 @@ from intercap_core.inputs.files import UnreadableFile, check_file
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
 LATEST_US = 10**15  # of a device's clock: thirty years; later times are damage
 MAX_SIDE = 16_384  # px of an image that is decoded
+# Exif orientation by the matrix [a b; c d] of a track, with x' = a x + c y and y' = b x + d y.
+# Source: ISO/IEC 14496-12, 8.3.2.
+_ORIENTATIONS = {
+    (1, 0, 0, 1): 1, (-1, 0, 0, 1): 2, (-1, 0, 0, -1): 3, (1, 0, 0, -1): 4,
+    (0, 1, 1, 0): 5, (0, 1, -1, 0): 6, (0, -1, -1, 0): 7, (0, -1, 1, 0): 8,
+}  # fmt: skip
 
 
 def open_container(path: Path, **options: str) -> Any:
@@ -93,7 +107,8 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
             if frames and seconds is not None:
                 share = min(1.0, (round(seconds * fps) + 1) / frames)
     with open_container(path) as container:
-        size = _first_size(container, container.streams[stream_index])
+        first = _first_image(container, container.streams[stream_index])
+    size = None if first is None else first.size
     if seconds is None:
         return RecordingPreview(size, None, None, share, counted=False)
     counted = frames > 0
@@ -101,25 +116,44 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
     return RecordingPreview(size, images, seconds, share, counted=counted)
 
 
-def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
-    """Width and height of the first image that decodes, after the rotation that the file states.
+def _orientation(frame: Any) -> int:
+    """Exif orientation of a decoded image, from the matrix of its track or its own Exif.
 
-    None if no image decodes.
+    Raises :class:`DamagedImage` for a rotation by other than quarter turns.
     """
-    try:
-        for number, packet in enumerate(container.demux(stream)):
-            if number > 60:  # two seconds, within which an image must decode
-                return None
-            if stream.codec_context.name == "mjpeg":
-                size = encoded_size(bytes(packet))
-                if size is not None:
-                    return size
-                continue
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return 1
+    a, b, _, c, d, *_ = (np.frombuffer(bytes(matrix), np.int32)[:9] / (1 << 16)).tolist()
+    orientation = _ORIENTATIONS.get((round(a), round(b), round(c), round(d)))
+    if orientation is None or abs(abs(a * d - b * c) - 1) > 1e-3 or max(abs(a), abs(b)) < 0.999:
+        raise DamagedImage(f"states a rotation by {frame.rotation} degrees, expected quarter turns")
+    return orientation
+
+
+class _FirstImage(NamedTuple):
+    """Properties of the first image of a video that decodes."""
+
+    size: tuple[int, int]
+    """Width and height as shown, after the rotation that the file states."""
+    orientation: int
+    """Exif orientation of the rotation."""
+    copied: bool
+    """Whether the packet is a JPEG file of the image as shown."""
+
+
+def _first_image(container: Any, stream: Any) -> _FirstImage | None:
+    """Properties of the first image that decodes; None if no image does."""
+    for number, packet in enumerate(demux(container, stream, lambda: None)):
+        if number > 60:  # two seconds, within which an image must decode
+            break
+        with contextlib.suppress(av.error.FFmpegError, OSError, DamagedImage):
             for frame in packet.decode():
-                turned = round((getattr(frame, "rotation", 0) or 0) / 90) % 2
-                return (frame.height, frame.width) if turned else (frame.width, frame.height)
-    except (av.error.FFmpegError, OSError):
-        pass
+                orientation, size = _orientation(frame), (frame.width, frame.height)
+                # Packets of interlaced videos hold two JPEG files, each with half of the rows.
+                copied = orientation == 1 and encoded_size(bytes(packet)) == size
+                copied = copied and stream.codec_context.name == "mjpeg"
+                return _FirstImage(size[::-1] if orientation >= 5 else size, orientation, copied)
     return None
 
 
@@ -219,11 +253,11 @@ def _decode_frames(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def read_video_size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a video's images; None if it cannot be opened."""
+    """Width and height of a video's images as shown; None if none can be decoded."""
     try:
         with open_container(path) as container:
-            context = container.streams.video[0].codec_context
-            return (context.width, context.height) if context and context.width else None
+            first = _first_image(container, container.streams.video[0])
+            return None if first is None else first.size
     except (UnreadableFile, av.error.FFmpegError, OSError, IndexError):
         return None
 
@@ -243,6 +277,7 @@ class VideoRecording(CameraRecording):
         fps: float | None,
         offset_s: float,
         times: Timestamps | None,
+        decoding: Decoding,
     ) -> None:
         """Open the file.
 
@@ -254,6 +289,7 @@ class VideoRecording(CameraRecording):
             offset_s: seconds that are added to all times.
             times: times of :func:`.timestamps.read_timestamps`, one for each image in order; None =
                 the file's clock from its first image on.
+            decoding: how depth files are read.
         """
         try:
             self._container = open_container(path)
@@ -264,10 +300,22 @@ class VideoRecording(CameraRecording):
             ) from error
         try:
             self._stream, rate = self._choose_stream(path, fps)
+            with open_container(path) as other:
+                first = _first_image(other, other.streams[self._stream.index])
+            orientation = 1 if first is None else first.orientation
+            if depth and orientation in (2, 3, 4):
+                raise UserError(
+                    f"{path}: states a half turn or a mirror (orientation {orientation}), which "
+                    "its depth files would not follow; turn the video itself, or remove the "
+                    "rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
+                )
         except UserError:
             self._container.close()
             raise
         super().__init__(path, camera, fps=rate)
+        self._copied = first is not None and first.copied
+        self._decoding = decoding
+        self._remarks: Counter[str] = Counter()
         self._offset_s = offset_s
         self._times = None if times is None else list(times.values())
         self._shots = pair_images(
@@ -302,7 +350,7 @@ class VideoRecording(CameraRecording):
     def preview(self) -> RecordingPreview:
         """Inspect the head, the first image, the length as :func:`preview_video`, depth files."""
         seen = preview_video(self.source, self._stream.index, self.fps)
-        faults = inspect_files(self._shots, self.camera.depth)
+        faults, _ = inspect_files(self._shots, self.camera.depth, self._decoding)
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
             if abs(stated - seen.images) > max(1, 0.02 * stated):  # images may be estimated
@@ -314,10 +362,9 @@ class VideoRecording(CameraRecording):
 
         Times are the stated timestamps, or else count from the first image.
         """
-        copied = self._stream.codec_context.name == "mjpeg"
         count = 0
         first: float | None = None
-        for stamp, content in self._copied() if copied else self._decoded():
+        for stamp, content in self._packet_files() if self._copied else self._decoded():
             seconds = count / self.fps if stamp is None else stamp
             self._first_s = seconds if self._first_s is None else self._first_s
             first = seconds if first is None else first
@@ -334,15 +381,16 @@ class VideoRecording(CameraRecording):
             yield Image("colour", time_us, content)
         if self._times is not None and count < len(self._times):
             self.notes.append(f"{len(self._times)} timestamps, but {count} images")
-        if not copied:
+        if not self._copied:
             codec = self._stream.codec_context.name
             self.notes.append(f"colour was recorded as {codec}, stored as JPEG of quality "
                               f"{JPEG_QUALITY}")  # fmt: skip
+        self.notes += list_remarks(self._remarks)
         if self._damaged:
             self.notes.append(f"{self._damaged} damaged packets left out")
         if self.truncated:
             self.notes.append(f"the file is cut off: {count} images could be read")
-        yield from read_pairs(self, self._shots)
+        yield from read_pairs(self, self._shots, self._decoding)
 
     def sound(self) -> Sound | None:
         """The file's first sound track."""
@@ -354,12 +402,19 @@ class VideoRecording(CameraRecording):
 
         return demux(self._container, self._stream, cut_off)
 
-    def _copied(self) -> Iterator[tuple[float | None, bytes]]:
-        """Yield time on the file's clock, seconds, None = not stated, and JPEG of each packet."""
+    def _packet_files(self) -> Iterator[tuple[float | None, bytes]]:
+        """Yield time on the file's clock, seconds, None = not stated, and JPEG of each packet.
+
+        A damaged packet is yielded as it is: it keeps its place among images without times.
+        """
         for packet in self._packets():
             if packet.size:
                 stamp = None if packet.pts is None else float(packet.pts * packet.time_base)
-                yield stamp, bytes(packet)
+                content = bytes(packet)
+                with contextlib.suppress(DamagedImage):
+                    content, remark = store_colour(content)
+                    self._remarks[remark] += 1
+                yield stamp, content
 
     def _decoded(self) -> Iterator[tuple[float | None, bytes]]:
         """The same of each decoded image, encoded as JPEG."""
@@ -373,7 +428,9 @@ class VideoRecording(CameraRecording):
                 if max(frame.width, frame.height) > MAX_SIDE:
                     self._damaged += 1
                     continue
-                image = frame.to_ndarray(format="bgr24")
-                # An upright phone records rotated images and states the rotation.
-                image = np.rot90(image, round((getattr(frame, "rotation", 0) or 0) / 90))
-                yield frame.time, encode_jpeg(np.ascontiguousarray(image))
+                try:  # an upright phone records rotated images and states the rotation
+                    image = turn(frame.to_ndarray(format="bgr24"), _orientation(frame))
+                except DamagedImage:
+                    self._damaged += 1
+                    continue
+                yield frame.time, encode_jpeg(image)

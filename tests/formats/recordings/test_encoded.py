@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.formats.recordings.image_files import (
+from intercap_core.formats.recordings.encodings import (
     RAW_FORMATS,
     decode_raw,
     encode_jpeg,

@@ -11,7 +11,7 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
-from intercap_core.formats.recordings.image_files import JPEG_QUALITY
+from intercap_core.formats.recordings.encodings import JPEG_QUALITY
 from intercap_core.formats.recordings.k4a import KinectLayout
 from intercap_core.formats.recordings.source import CameraRecording, Image
 from intercap_core.studio.calibration import write_calibration

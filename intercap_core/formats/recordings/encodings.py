@@ -1,0 +1,278 @@
+"""Encodings of single colour images: size, orientation, and the form in which an image is stored.
+
+Stored is a whole JPEG or PNG file without an orientation, so that every reader of the frames
+artefact (OpenCV, a browser, FFmpeg) shows the same pixels. JPEG: ITU-T T.81, annex B; PNG: RFC 2083
+with the chunk eXIf; Exif: CIPA DC-008, 4.6; TIFF: revision 6.0.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+TIFF_STARTS = (b"II*\0", b"MM\0*")
+JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; an error of about 1 grey level
+RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
+# Markers but those within a scan: stuffed bytes and restarts.
+_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+_AFTER_A_CUT = bytes((97 * k + 13) % 255 for k in range(256))  # arbitrary data without a marker
+
+OrientationUse = Literal["turn", "ignore", "refuse"]
+"""What is done with an image that states an orientation: turn its pixels, as OpenCV and FFmpeg do;
+keep them as stored; or refuse half turns and mirrors, because depth would not follow them."""
+
+
+class DamagedImage(Exception):
+    """The file is no usable image or mask; the message follows the file's name."""
+
+
+class _Jpeg(NamedTuple):
+    """Structure of the first image of a JPEG file."""
+
+    size: tuple[int, int]
+    """Width and height as stored."""
+    orientation: int
+    """Exif orientation, 1 to 8."""
+    orientation_at: int
+    """Offset of the low byte of the Exif orientation; 0 without an entry."""
+    end: int
+    """Offset after the last byte of the image."""
+    ended: bool
+    """Whether the end marker is there."""
+
+
+def encoded_size(content: bytes) -> tuple[int, int] | None:
+    """Width and height of a JPEG or PNG file; None if the content is no complete file.
+
+    The size is that of the image as OpenCV decodes it: rotated by a JPEG's Exif orientation. The
+    image's end must be there (anything may follow that of a JPEG), and enough data for its pixels.
+    Pixels are not decoded.
+    """
+    if content.startswith(PNG_START):
+        complete = content.endswith(PNG_END) and len(content) >= 33
+        return struct.unpack(">II", content[16:24]) if complete else None
+    jpeg = _parse_jpeg(content)
+    if jpeg is None or not jpeg.ended:
+        return None
+    return jpeg.size[::-1] if jpeg.orientation >= 5 else jpeg.size
+
+
+def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tuple[bytes, str]:
+    """Convert a JPEG, PNG, BMP or TIFF file to the form that is stored.
+
+    A JPEG or PNG file without orientation is copied up to its end. Raises :class:`DamagedImage`.
+
+    Returns:
+        The stored file, and what was changed, as a remark that follows "colour images"; "" if the
+        file is stored as it is.
+    """
+    jpeg = _parse_jpeg(content)
+    remarks = []
+    if jpeg is not None:
+        orientation = jpeg.orientation
+        whole = content[: jpeg.end] if jpeg.ended else _complete_jpeg(content[: jpeg.end])
+        if not jpeg.ended:
+            remarks.append("have no end marker, but are complete")
+        if content[jpeg.end :].lstrip(b"\0\xff").startswith(JPEG_START[1:] + b"\xff"):
+            remarks.append("are followed by another image in the same file, which is not read")
+    elif content.startswith(PNG_START):
+        if encoded_size(content) is None:
+            raise DamagedImage("is cut off")
+        if content[24:26] == b"\x10\0":
+            raise DamagedImage("is a 16-bit grey PNG, as depth is; move depth files to depth/")
+        whole, orientation = content, _png_orientation(content)
+    elif content.startswith((*TIFF_STARTS, b"BM")):
+        kind = "BMP" if content.startswith(b"BM") else "TIFF"
+        orientation = 1 if kind == "BMP" else _tiff_entry(content, 0x0112)[0]
+        if kind == "BMP" and int.from_bytes(content[2:6], "little") > len(content):
+            raise DamagedImage("is cut off")
+        if kind == "TIFF" and _tiff_entry(content, 0)[1]:
+            remarks.append("are followed by another image in the same file, which is not read")
+        whole = encode_jpeg(_decode_8_bit(content))
+        remarks.append(f"are {kind}, stored as JPEG of quality {JPEG_QUALITY}")
+    elif content.startswith(JPEG_START):
+        raise DamagedImage("is no whole JPEG")
+    else:
+        raise DamagedImage("is no JPEG, PNG, BMP or TIFF")
+    orientation = orientation if 1 <= orientation <= 8 else 1
+    if orientation == 1:
+        return whole, "; ".join(remarks)
+    if orientation_use == "ignore":
+        if jpeg is not None:  # Exif orientation 1: as stored
+            at = jpeg.orientation_at
+            whole = whole[:at] + b"\1" + whole[at + 1 :]
+        elif content.startswith(PNG_START):
+            whole = encode_jpeg(_decode_8_bit(content))
+        remarks.append(
+            f"state orientation {orientation}, which the calibration leaves aside: used as stored"
+        )
+        return whole, "; ".join(remarks)
+    if orientation_use == "refuse" and orientation < 5:
+        raise DamagedImage(
+            f"states orientation {orientation} (turned or mirrored), the depth images none; turn "
+            "the colour images, or remove the entry (exiftool -Orientation= FILES)"
+        )
+    stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(whole, np.uint8), stored)
+    if image is None:
+        raise DamagedImage("does not decode")
+    remarks.append(
+        f"state orientation {orientation}, were turned by it and stored as JPEG of quality "
+        f"{JPEG_QUALITY}"
+    )
+    return encode_jpeg(turn(image, orientation)), "; ".join(remarks)
+
+
+def turn(image: np.ndarray, orientation: int) -> np.ndarray:
+    """The image (H, W, ...) as it is to be shown, by its Exif orientation 1 to 8."""
+    image = image.swapaxes(0, 1) if orientation >= 5 else image
+    rows = -1 if orientation in (3, 4, 7, 8) else 1
+    columns = -1 if orientation in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(image[::rows, ::columns])
+
+
+def _decode_8_bit(content: bytes) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of a file as stored; raises :class:`DamagedImage`."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DamagedImage("does not decode")
+    if image.dtype != np.uint8:  # of 10 or 12 bits, the share that holds the image is unknown
+        raise DamagedImage(f"has pixels of {image.dtype}, expected 8 bits a channel")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels not in (1, 3, 4):
+        raise DamagedImage(f"has {channels} channels, expected 1, 3 or 4")
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if channels == 1 else image[..., :3]
+
+
+def _parse_jpeg(content: bytes) -> _Jpeg | None:
+    """Parse the first image; None if it is none or holds too little data for its pixels."""
+    if not content.startswith(JPEG_START):
+        return None
+    at, data, needed = 2, 0, 0.0  # bytes
+    size: tuple[int, int] | None = None
+    orientation, orientation_at = 1, 0
+    end = len(content.rstrip(b"\0"))
+    ended = False
+    while (found := _MARKER.search(content, at)) is not None:
+        marker, at = content[found.end() - 1], found.end()
+        if marker in (0xD8, 0xD9):  # a start here is that of the next image
+            ended = marker == 0xD9
+            end = at if ended else found.start()
+            break
+        if marker == 0x01:  # has no content
+            continue
+        after = at + int.from_bytes(content[at : at + 2], "big")
+        if after < at + 2 or after > len(content):
+            return None
+        # Frame headers are C0 to CF except tables, reserved and arithmetic conditioning.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            size, needed = _frame_header(marker, content[at + 2 : after])
+        if marker == 0xE1 and content[at + 2 : at + 8] == b"Exif\0\0":
+            orientation, where = _tiff_entry(content[at + 8 : after], 0x0112)
+            orientation = orientation if 1 <= orientation <= 8 else 1
+            orientation_at = at + 8 + where if where else 0
+        at = after
+        if marker == 0xDA:  # a scan
+            following = _MARKER.search(content, at)
+            stop = len(content.rstrip(b"\0")) if following is None else following.start()
+            data += max(0, stop - at)
+            at = max(at, stop)
+    if size is None or min(size) < 1 or data < max(1, needed):
+        return None
+    return _Jpeg(size, orientation, orientation_at, end, ended)
+
+
+def _frame_header(marker: int, header: bytes) -> tuple[tuple[int, int] | None, float]:
+    """Width and height, and the least number of bytes that the image's blocks can have.
+
+    A block has at least a bit for its mean and, in sequential Huffman coding, one for its end.
+    """
+    if len(header) < 6 or len(header) < 6 + 3 * header[5]:
+        return None, 0.0
+    height, width = struct.unpack(">HH", header[1:5])
+    factors = [(sides >> 4, sides & 15) for sides in header[7 : 7 + 3 * header[5] : 3]]
+    most = [max((factor[axis] for factor in factors), default=0) for axis in (0, 1)]
+    bits = {0xC0: 2, 0xC1: 2, 0xC2: 1}.get(marker, 0)
+    if not all(most):
+        return (width, height), 0.0
+    blocks = sum(
+        -(-width * across // (8 * most[0])) * -(-height * down // (8 * most[1]))
+        for across, down in factors
+    )
+    return (width, height), blocks * bits / 8
+
+
+def _complete_jpeg(content: bytes) -> bytes:
+    """Add the end marker that a JPEG file lacks; raises :class:`DamagedImage` if more is missing.
+
+    An image is complete if data behind its end do not change it.
+    """
+    content += b"\0" * content.endswith(b"\xff")  # half of a marker, or of a stuffed byte
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
+    images = [
+        cv2.imdecode(np.frombuffer(content + tail + JPEG_END, np.uint8), flags)
+        for tail in (b"", _AFTER_A_CUT)
+    ]
+    if images[0] is None or images[1] is None or not np.array_equal(*images):
+        raise DamagedImage("is cut off")
+    return content + JPEG_END
+
+
+def _png_orientation(content: bytes) -> int:
+    """Orientation of the chunk eXIf; 1 (as stored) without one."""
+    at = len(PNG_START)
+    while at + 12 <= len(content):
+        length, kind = struct.unpack(">I4s", content[at : at + 8])
+        if kind == b"eXIf":
+            return _tiff_entry(content[at + 8 : at + 8 + length], 0x0112)[0]
+        at += 12 + length
+    return 1
+
+
+def _tiff_entry(tiff: bytes, wanted: int) -> tuple[int, int]:
+    """Value of an entry of the first directory, and the offset of its low byte; (1, 0) without it.
+
+    For ``wanted`` 0, the second number is the offset of the next directory; 0 = none.
+    """
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None or len(tiff) < 10:
+        return 1, 0
+    (at,) = struct.unpack(f"{order}I", tiff[4:8])
+    (entries,) = struct.unpack(f"{order}H", tiff[at : at + 2].ljust(2, b"\0"))
+    for start in range(at + 2, min(at + 2 + 12 * entries, len(tiff) - 11), 12):
+        tag, _, _, value = struct.unpack(f"{order}HHIH", tiff[start : start + 10])
+        if tag == wanted:
+            return value, start + (8 if order == "<" else 9)
+    if wanted == 0:
+        at += 2 + 12 * entries
+        return 1, struct.unpack(f"{order}I", tiff[at : at + 4].ljust(4, b"\0"))[0]
+    return 1, 0
+
+
+def encode_jpeg(image: np.ndarray) -> bytes:
+    """Encode (H, W, 3) uint8 BGR as JPEG of :data:`JPEG_QUALITY`."""
+    done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise ValueError(f"an image of {image.shape} {image.dtype} cannot be stored as JPEG")
+    return content.tobytes()
+
+
+def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.ndarray:
+    """Decode a raw image of ``size`` (width, height) to (H, W, 3) uint8 BGR.
+
+    ``pixel_format`` is one of :data:`RAW_FORMATS`. YUV is BT.601 with limited range, as in the
+    viewer of the Azure Kinect. Raises ValueError for another number of bytes.
+    """
+    width, height = size
+    shape, code = {
+        "NV12": ((height * 3 // 2, width), cv2.COLOR_YUV2BGR_NV12),
+        "YUY2": ((height, width, 2), cv2.COLOR_YUV2BGR_YUY2),
+        "BGRA": ((height, width, 4), cv2.COLOR_BGRA2BGR),
+    }[pixel_format]
+    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(shape), code)
