@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from intercap_core.scene.background import Background, camera_background
 from intercap_core.scene.camera_agreement import find_disagreements, widened
 from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
 from intercap_core.scene.constraints import FloorConstraint
+from intercap_core.scene.depth_scale import describe_depth_scale
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.ground import (
     GroundPlane,
@@ -56,6 +58,8 @@ from intercap_core.scene.up import (
     trunk_direction,
 )
 from intercap_core.schemas import SCENE
+
+log = logging.getLogger(__name__)
 
 # A camera is reported if it sees the rig's centre less accurately than this, because its pose is
 # uncertain (standard deviation).
@@ -129,6 +133,7 @@ def run(
             search=settings.find_starts,
         )  # fmt: skip
         subject, image_of = moments.subject, moments.image_of
+        scales = describe_depth_scale(source, rig, subject.joints, image_of)
         ground_notes = _check_stated_up(source, subject)
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
@@ -158,6 +163,10 @@ def run(
         for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
             note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
+        for name, note, scale in zip(rig.names, notes, scales, strict=True):
+            if scale:
+                note.append(scale)
+                log.warning("sequence %s, camera %s: %s", source.sequence, name, scale)
         ground_notes += more_notes
         scene = _Scene(
             rig, backgrounds, moments, refined, ground, up, ground_notes, notes, slides, known_to
