@@ -17,9 +17,13 @@ from intercap_core.person.sides import BODY_POINTS
 FACTORS = (2.0, 4.0, 5.0, 10.0, 100.0, 1000.0)  # between the units above, and their inverses
 IMAGES = 20  # of each camera, which hold hundreds of body points
 MIN_POINTS = 12  # half of the body points of one image
-# Of the logarithm of a ratio. The depth of skin is nearer than the joint by up to 5 %; values in
-# metres are rounded by up to 25 % at 2 m. Half of the logarithm of 2 would be 0.35.
-TOLERANCE = 0.25
+# Depth of the skin over that of the joint: skin is nearer by up to 0.13 m at 1.3 m, feet stand on
+# the floor behind them. Narrow enough to tell 4 from 5.
+ON_THE_BODY = (0.87, 1.1)
+# Share of points on the body. Others see what is before or behind it: half of the body can be
+# hidden or, at the rims of limbs, missed, but rarely four fifths.
+MIN_SHARE = 0.2
+MAX_SHARE_AS_STATED = 0.05
 
 
 def describe_depth_scale(
@@ -65,17 +69,26 @@ def depth_ratios(depth: np.ndarray, camera: Camera, joints: np.ndarray) -> np.nd
 
 
 def describe_factor(ratios: np.ndarray) -> str:
-    """Note on the factor near which at least half of the ratios (N,) lie; "" if none is."""
-    if len(ratios) < MIN_POINTS:
+    """Note on the factor by which the ratios (N,) are those of points on the body; "" if none.
+
+    Surfaces behind the body are common, those before it rare: the smallest factor is taken.
+    """
+    if len(ratios) < MIN_POINTS or _share(ratios, 1.0) > MAX_SHARE_AS_STATED:
         return ""
-    low, middle, high = np.quantile(np.log(ratios), [0.25, 0.5, 0.75])
-    signed = np.log([*FACTORS, *(1 / factor for factor in FACTORS)])
-    nearest = signed[np.abs(signed - middle).argmin()]
-    if max(abs(low - nearest), abs(high - nearest)) > TOLERANCE:
+    factors = sorted((*FACTORS, *(1 / factor for factor in FACTORS)))
+    factor = next((f for f in factors if _share(ratios, f) >= MIN_SHARE), 1.0)
+    if factor == 1.0:
         return ""
-    factor = np.exp(abs(nearest))
-    way, right = ("as far as", "divide") if nearest > 0 else ("closer than", "multiply")
+    times = max(factor, 1 / factor)
+    way, right = ("as far as", "divide") if factor > 1 else ("closer than", "multiply")
     return (
-        f"its depth puts the person {factor:.0f} times {way} the keypoints do: {right} "
-        f"depth_unit of the calibration by {factor:.0f} (it is 0.001, millimetres, if not stated)"
+        f"its depth puts the person {times:.0f} times {way} the keypoints do: {right} depth_unit "
+        f"of the calibration by {times:.0f} (it is 0.001, millimetres, if not stated)"
     )
+
+
+def _share(ratios: np.ndarray, factor: float) -> float:
+    """Share of the ratios (N,) that are those of points on the body with depth scaled by factor."""
+    # Whole metres are rounded by a quarter; no other factor is near.
+    low, high = ON_THE_BODY if factor > 0.002 else (0.7, 1.4)
+    return float(np.mean((ratios > low * factor) & (ratios < high * factor)))

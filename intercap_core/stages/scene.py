@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,8 +57,6 @@ from intercap_core.scene.up import (
     trunk_direction,
 )
 from intercap_core.schemas import SCENE
-
-log = logging.getLogger(__name__)
 
 # A camera is reported if it sees the rig's centre less accurately than this, because its pose is
 # uncertain (standard deviation).
@@ -163,10 +160,8 @@ def run(
         for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
             note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
-        for name, note, scale in zip(rig.names, notes, scales, strict=True):
-            if scale:
-                note.append(scale)
-                log.warning("sequence %s, camera %s: %s", source.sequence, name, scale)
+        for note, scale in zip(notes, scales, strict=True):
+            note += [scale] if scale else []
         ground_notes += more_notes
         scene = _Scene(
             rig, backgrounds, moments, refined, ground, up, ground_notes, notes, slides, known_to
