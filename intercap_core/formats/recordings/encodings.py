@@ -99,7 +99,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
     elif content.startswith(JPEG_START):
         raise DamagedImage("is no whole JPEG")
     else:
-        raise DamagedImage("is no JPEG, PNG, BMP or TIFF")
+        raise DamagedImage("is no whole JPEG, PNG, BMP or TIFF")
     orientation = orientation if 1 <= orientation <= 8 else 1
     if orientation == 1:
         return whole, "; ".join(remarks)
@@ -209,19 +209,28 @@ def _frame_header(marker: int, header: bytes) -> tuple[tuple[int, int] | None, f
 
 
 def _complete_jpeg(content: bytes) -> bytes:
-    """Add the end marker that a JPEG file lacks; raises :class:`DamagedImage` if more is missing.
-
-    An image is complete if data behind its end do not change it.
-    """
+    """Add the missing end marker of a JPEG file; raises :class:`DamagedImage` if more is missing."""
     content += b"\0" * content.endswith(b"\xff")  # half of a marker, or of a stuffed byte
-    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
-    images = [
-        cv2.imdecode(np.frombuffer(content + tail + JPEG_END, np.uint8), flags)
-        for tail in (b"", _AFTER_A_CUT)
-    ]
-    if images[0] is None or images[1] is None or not np.array_equal(*images):
+    if not holds_all_pixels(content + JPEG_END):
         raise DamagedImage("is cut off")
     return content + JPEG_END
+
+
+def holds_all_pixels(content: bytes) -> bool:
+    """Whether a file with an end is no JPEG, or a JPEG with data for all pixels.
+
+    Further data before the end marker do not change a complete image. Decodes the image twice, at
+    an eighth of its size.
+    """
+    if not content.startswith(JPEG_START):
+        return True
+    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
+    data = content.removesuffix(JPEG_END)
+    first, second = (
+        cv2.imdecode(np.frombuffer(data + tail + JPEG_END, np.uint8), flags)
+        for tail in (b"", _AFTER_A_CUT)
+    )
+    return first is not None and second is not None and np.array_equal(first, second)
 
 
 def _png_orientation(content: bytes) -> int:

@@ -20,6 +20,7 @@ from intercap_core.formats.recordings.encodings import (
     DamagedImage,
     OrientationUse,
     encoded_size,
+    holds_all_pixels,
     store_colour,
 )
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
@@ -99,7 +100,7 @@ def _check_depth_head(content: bytes, size: tuple[int, int]) -> None:
 def _check_depth_size(actual: tuple[int, ...], size: tuple[int, int]) -> None:
     if actual != size:
         raise DamagedImage(
-            f"has {actual[0]}x{actual[1]} pixels, the depth lens {size[0]}x{size[1]}"
+            f"has {actual[0]}x{actual[1]} pixels, the colour images {size[0]}x{size[1]}"
         )
 
 
@@ -189,7 +190,10 @@ def inspect_files(
         for index in chosen:
             try:
                 if kind == "colour":
-                    remarks[read_colour(paths[index], decoding.orientation)[1]] += 1
+                    content, remark = read_colour(paths[index], decoding.orientation)
+                    remarks[remark] += 1
+                    if not holds_all_pixels(content):
+                        raise DamagedImage("lacks a part of its pixels")
                 elif lens is not None:
                     size = (lens.width, lens.height)
                     read_depth(paths[index], size, decoding.depth_unit_m)

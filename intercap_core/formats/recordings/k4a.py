@@ -328,10 +328,10 @@ class KinectLayout(RecordingLayout):
         self._paths: dict[str, Path] = {}
         for file in sorted(sequence.recordings.iterdir()):
             if file.suffix.lower() == ".mkv" and not file.name.startswith("."):
-                other = self._paths.setdefault(file.stem, file)
-                if other != file:
+                first = self._paths.setdefault(file.stem, file)
+                if first != file:
                     raise UserError(
-                        f"{sequence.recordings}: camera {file.stem} is recorded as {other.name} "
+                        f"{sequence.recordings}: camera {file.stem} is recorded as {first.name} "
                         f"and {file.name}; keep one"
                     )
         self.names = list(self._paths)

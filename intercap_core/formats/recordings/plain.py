@@ -149,7 +149,7 @@ class _CameraFolder:
             path,
         ]
         depth_folders = [entry for entry in below if entry.name.lower() == "depth"]
-        used: list[list[Path]] = []
+        used: list[list[Path]] = []  # files of colour, and of depth
         unused: list[Path] = []
         for folders, suffixes in (
             (colour_folders, IMAGE_SUFFIXES),
@@ -158,7 +158,7 @@ class _CameraFolder:
             holding = {entry: files for entry in folders if (files := _images(entry, suffixes))}
             used.append(next(iter(holding.values()), []))
             unused += list(holding)[1:]
-        return cls(path, *used, unused)
+        return cls(path, used[0], used[1], unused)
 
     def notes(self, known: CalibratedCamera) -> list[str]:
         """Notes on files that are not read, and on depth that is stated but absent."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 
 from intercap_core.formats.recordings.encodings import (
     RAW_FORMATS,
+    DamagedImage,
     decode_raw,
     encode_jpeg,
     encoded_size,
+    holds_all_pixels,
+    store_colour,
 )
 
 
@@ -84,3 +88,97 @@ def test_raw_images_of_another_size_are_refused(name):
     assert decode_raw(content, name, (64, 48)).shape == (48, 64, 3)
     with pytest.raises(ValueError, match="reshape"):
         decode_raw(content[:-1], name, (64, 48))
+
+
+def encoded(suffix: str, image: np.ndarray, options: tuple[int, ...] = ()) -> bytes:
+    return cv2.imencode(suffix, image, options)[1].tobytes()
+
+
+def shown(content: bytes, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+
+
+PROGRESSIVE = (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+JPEG = encoded(".jpg", picture(160, 120))
+OTHER = encoded(".jpg", picture(160, 120)[:, ::-1])
+TIFF_ORIENTATION = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)
+
+
+@pytest.mark.parametrize("tail", [b"\xff" * 64, bytes(64), b"MODEL" * 20, b"\0\0\0\x18ftypmp42\0"])
+def test_what_follows_a_jpeg_is_left_out(tail):
+    assert store_colour(JPEG + tail) == (JPEG, "")
+    assert encoded_size(JPEG + tail) == (160, 120)
+
+
+def test_further_images_of_a_file_are_noted():
+    for content in (JPEG + OTHER, JPEG + bytes(9) + OTHER, JPEG[:-2] + OTHER):
+        stored, remark = store_colour(content)
+        assert stored == JPEG and "followed by another image" in remark
+
+
+def test_a_complete_jpeg_without_its_end_marker_is_used():
+    for whole in (JPEG, encoded(".jpg", picture(160, 120), PROGRESSIVE)):
+        for content in (whole[:-2], whole[:-1], whole[:-2] + bytes(500)):
+            stored, remark = store_colour(content)
+            assert np.array_equal(shown(stored), shown(whole)) and "no end marker" in remark
+
+
+def test_jpegs_without_all_data_are_damaged():
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+    content = encoded(".jpg", noise)
+    scan = content.index(b"\xff\xda") + 14
+    half = content[: len(content) // 2]
+    for damaged in (
+        half, half + bytes(5000), content[:scan] + b"\xff\xd9", content[: scan + 60] + b"\xff\xd9",
+        content[:scan] + bytes(9000),
+    ):  # fmt: skip
+        with pytest.raises(DamagedImage):
+            store_colour(damaged)
+    assert holds_all_pixels(content) and not holds_all_pixels(half + b"\xff\xd9")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_stored_images_have_no_orientation(orientation):
+    """OpenCV is the peer that turns; the stored file looks alike with and without orientation."""
+    content = with_exif(JPEG, orientation, ">")
+    for use, flags in (("turn", cv2.IMREAD_COLOR), ("ignore", cv2.IMREAD_COLOR | 128)):
+        stored, remark = store_colour(content, use)
+        true = shown(content, flags).astype(int)
+        assert shown(stored).shape == shown(stored, cv2.IMREAD_COLOR | 128).shape == true.shape
+        assert np.abs(shown(stored) - true).mean() < 1 and bool(remark) == (orientation > 1)
+    if orientation in (2, 3, 4):
+        with pytest.raises(DamagedImage, match="the depth images none"):
+            store_colour(content, "refuse")
+    else:
+        store_colour(content, "refuse")
+
+
+def test_a_png_with_an_orientation_is_turned():
+    png = encoded(".png", picture(160, 120))
+    chunk = b"eXIf" + TIFF_ORIENTATION
+    length, checksum = struct.pack(">I", len(chunk) - 4), struct.pack(">I", zlib.crc32(chunk))
+    stored, _ = store_colour(png[:33] + length + chunk + checksum + png[33:])
+    assert np.abs(shown(stored).astype(int) - picture(160, 120)[::-1, ::-1]).mean() < 2
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tif"])
+def test_bmp_and_tiff_are_stored_as_jpeg(suffix):
+    stored, remark = store_colour(encoded(suffix, picture(160, 120)))
+    assert stored.startswith(b"\xff\xd8") and "stored as JPEG of quality 97" in remark
+    assert np.abs(shown(stored).astype(int) - picture(160, 120)).mean() < 2
+    with pytest.raises(DamagedImage):
+        store_colour(encoded(suffix, picture(160, 120))[:-4000])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (encoded(".tif", picture().astype(np.uint16)), "uint16, expected 8 bits"),
+        (encoded(".tif", picture().astype(np.float32)), "float32, expected 8 bits"),
+        (encoded(".png", picture()[..., 0].astype(np.uint16)), "16-bit grey PNG, as depth"),
+        (encoded(".webp", picture()), "no whole JPEG, PNG, BMP or TIFF"),
+    ],
+)
+def test_other_images_are_refused(content, words):
+    with pytest.raises(DamagedImage, match=words):
+        store_colour(content)

@@ -14,7 +14,10 @@ import pytest
 from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.encodings import turn
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.recordings.layouts import list_unread, open_layout
+from intercap_core.formats.recordings.video import read_video_size
 from intercap_core.schemas import FRAMES
 from tests.helpers.kinect_files import notes_of, row, run
 from tests.helpers.videos import write_video
@@ -351,3 +354,113 @@ def test_a_recording_without_times_is_refused(capture):
     capture.calibration.write_text(json.dumps(content))
     with pytest.raises(UserError, match="add fps to the calibration"):
         run(capture)
+
+
+def states_matrix(path: Path, matrix: tuple[int, int, int, int]) -> None:
+    """Write the display matrix [a b; c d] into the header of an MP4 file."""
+    content = bytearray(path.read_bytes())
+    at = content.index(b"tkhd") + 4 + 40
+    one = 1 << 16
+    a, b, c, d = (one * value for value in matrix)
+    content[at : at + 36] = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
+@pytest.mark.parametrize(
+    ("matrix", "orientation"),
+    [((-1, 0, 0, 1), 2), ((-1, 0, 0, -1), 3), ((0, 1, -1, 0), 6), ((0, -1, 1, 0), 8)],
+)
+def test_video_is_stored_as_it_is_shown(capture, codec, matrix, orientation):
+    path = capture.recordings / "top.mp4"
+    remove_images(capture, "top/*")
+    write_video(path, pictures(2), codec, fps=FPS)
+    states_matrix(path, matrix)
+    if orientation >= 5:
+        size = {"image_size": [48, 64], "camera_matrix": [[60, 0, 24], [0, 60, 32], [0, 0, 1]]}
+        capture.calibration.write_text(json.dumps(calibrated(top=size)))
+    expected = turn(picture(2, 0), orientation)
+    assert read_video_size(path) == expected.shape[1::-1]
+    with open_layout(capture).open("top") as recording:
+        assert recording.preview().size == expected.shape[1::-1]
+        image = next(iter(recording.images()))
+    shown = cv2.imdecode(np.frombuffer(image.content, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(shown.astype(int) - expected).mean() < 5
+
+
+def test_a_video_turned_by_half_with_depth_is_refused(capture):
+    remove_images(capture, "left/*.jpg")
+    path = capture.recordings / "left.mp4"
+    write_video(path, pictures(0), "mpeg4", fps=FPS)
+    states_matrix(path, (-1, 0, 0, -1))
+    with pytest.raises(UserError, match="half turn or a mirror"):
+        open_layout(capture).open("left")
+
+
+def test_folders_and_suffixes_in_capitals_are_read(capture):
+    (capture.recordings / "left" / "depth").rename(capture.recordings / "left" / "DEPTH")
+    (capture.recordings / "right" / "colour").rename(capture.recordings / "right" / "RGB")
+    for path in [*capture.recordings.glob("left/*.jpg"), *capture.recordings.glob("*/*/*.png")]:
+        path.rename(path.with_suffix(path.suffix.upper()))
+    assert list_unread(capture) == []
+    with Frames.open(run(capture)) as frames:
+        assert frames.colour_available.all() and frames.depth_available[:, :2].all()
+        assert np.array_equal(frames.depth(3, 0), depth_of(0, 3))
+
+
+@pytest.mark.parametrize(
+    ("place", "count"),
+    [
+        ("left/image.webp", 1), ("left/depth/00000.exr", 3), ("left/depth_raw/00000.png", 8),
+        ("cam 3.mp4", 1), ("caméra/00000.jpg", 2), ("top.mp4.bak", 1), ("left/video/left.mp4", 1),
+        ("top.wmv", 1), ("left/times.csv", 1), ("left/a/b/c.png", 1),
+    ],
+)  # fmt: skip
+def test_files_that_nothing_reads_are_listed(capture, place, count):
+    first = capture.recordings / place
+    first.parent.mkdir(exist_ok=True, parents=True)
+    for number in range(count):
+        first.with_name(first.name.replace("00000", f"{number:05d}")).write_bytes(b"")
+    (note,) = list_unread(capture)
+    assert f"nothing reads {place}" in note and "layout plain reads" in note
+    assert count == 1 or f"and {count - 1} more" in note
+
+
+def test_two_folders_of_colour_are_noted(capture):
+    write_images(capture.recordings / "left", 0, range(8), colour="colour")
+    with open_layout(capture).open("left") as recording:
+        assert "the images in left/ are not read" in recording.notes[0]
+
+
+def test_depth_that_the_calibration_states_but_no_file_holds_is_noted(capture):
+    remove_images(capture, "left/depth/*")
+    assert "states its depth, but it has no depth files" in notes_of(run(capture))["left"]
+
+
+def test_the_unit_of_depth_is_stated_for_all_cameras_or_one(capture):
+    capture.calibration.write_text(
+        json.dumps(calibrated(right={"depth_unit": 0.0002}) | {"depth_unit": 0.002})
+    )
+    with Frames.open(run(capture)) as frames:
+        assert np.array_equal(frames.depth(2, 0), 2 * depth_of(0, 2))
+        assert np.array_equal(frames.depth(2, 1), np.rint(depth_of(1, 2, SIZE) / 5))
+
+
+@pytest.mark.parametrize("unit", [1000, 1, 0, -0.001, "mm"])
+def test_an_impossible_unit_of_depth_is_refused(capture, unit):
+    capture.calibration.write_text(json.dumps(calibrated() | {"depth_unit": unit}))
+    with pytest.raises(UserError, match="depth_unit is"):
+        open_layout(capture)
+
+
+def test_images_that_lack_most_data_are_left_out(capture):
+    noise = np.random.default_rng(0).integers(0, 255, (*SIZE[::-1], 3)).astype(np.uint8)
+    content = cv2.imencode(".jpg", noise)[1].tobytes()
+    for number in range(8):
+        (capture.recordings / "left" / f"{number:05d}.jpg").write_bytes(content)
+    cut = capture.recordings / "left" / "00004.jpg"
+    cut.write_bytes(content[: len(content) // 2] + b"\xff\xd9")
+    output = run(capture)
+    assert "1 damaged images left out" in notes_of(output)["left"]
+    with Frames.open(output) as frames:
+        assert frames.colour_available[:, 0].tolist() == [True] * 4 + [False] + [True] * 3
