@@ -209,7 +209,7 @@ def _frame_header(marker: int, header: bytes) -> tuple[tuple[int, int] | None, f
 
 
 def _complete_jpeg(content: bytes) -> bytes:
-    """Add the missing end marker of a JPEG file; raises :class:`DamagedImage` if more is missing."""
+    """Add the missing end marker of a JPEG file; raises :class:`DamagedImage` if more is cut."""
     content += b"\0" * content.endswith(b"\xff")  # half of a marker, or of a stuffed byte
     if not holds_all_pixels(content + JPEG_END):
         raise DamagedImage("is cut off")

@@ -27,6 +27,7 @@ from intercap_core.formats.recordings.encodings import (
     turn,
 )
 from intercap_core.formats.recordings.image_files import (
+    DEFAULT,
     Decoding,
     inspect_files,
     list_remarks,
@@ -277,7 +278,7 @@ class VideoRecording(CameraRecording):
         fps: float | None,
         offset_s: float,
         times: Timestamps | None,
-        decoding: Decoding,
+        decoding: Decoding = DEFAULT,
     ) -> None:
         """Open the file.
 
