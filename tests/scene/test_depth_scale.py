@@ -26,9 +26,8 @@ def body_and_depth(unit_mm: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     ("unit_mm", "expected"),
     [
-        (1, ""), (0.5, "2 times as far as"), (0.25, "4 times as far as"),
-        (0.2, "5 times as far as"), (0.1, "10 times as far as"), (2, "2 times closer than"),
-        (10, "10 times closer than"), (1000, "1000 times closer than"),
+        (1, ""), (0.5, "is 2 times"), (0.25, "is 4 times"), (0.2, "is 5 times"),
+        (0.1, "is 10 times"), (2, "is 0.5 times"), (10, "is 0.1 times"), (1000, "is 0.001 times"),
     ],
 )  # fmt: skip
 def test_the_unit_is_named(unit_mm, expected):
@@ -39,11 +38,19 @@ def test_the_unit_is_named(unit_mm, expected):
     assert expected in note and bool(expected) == bool(note)
 
 
-def test_a_wall_behind_most_keypoints_is_no_unit():
-    """Depth misses thin limbs: three quarters of the points see a wall at twice the distance."""
-    behind = np.r_[np.full(75, 1.95), np.full(25, 0.98)]
-    assert describe_factor(behind) == ""
-    assert "5 times as far as" in describe_factor(5 * behind)
+@pytest.mark.parametrize(
+    ("elsewhere", "words"),
+    [(0.4, "is 2 or 5 times"), (0.49, "is 5 times"), (1.95, "is 5 or 10 times")],
+)
+def test_an_object_or_a_wall_at_most_points_is_no_unit(elsewhere, words):
+    ratios = np.r_[np.full(75, elsewhere), np.full(25, 0.98)]
+    assert describe_factor(ratios) == ""
+    assert words in describe_factor(5 * ratios)
+
+
+@pytest.mark.parametrize("ratios", [[], [0.98] * 11, [3.0] * 100, [0.98, *[3.0] * 99]])
+def test_the_unit_is_not_determined_without_points_on_the_body(ratios):
+    assert "not determined" in describe_factor(np.array(ratios))
 
 
 def test_unknown_joints_and_pixels_without_depth_are_left_out():
@@ -51,4 +58,3 @@ def test_unknown_joints_and_pixels_without_depth_are_left_out():
     joints[:20] = np.nan
     depth[:, :80] = 0
     assert len(depth_ratios(depth, CAMERA, joints)) < 5
-    assert describe_factor(np.full(5, 10.0)) == ""

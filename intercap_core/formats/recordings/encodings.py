@@ -11,6 +11,7 @@ import re
 import struct
 from typing import Literal, NamedTuple
 
+import av
 import cv2
 import numpy as np
 
@@ -21,7 +22,6 @@ JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; an error of about 
 RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
 # Markers but those within a scan: stuffed bytes and restarts.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
-_AFTER_A_CUT = bytes((97 * k + 13) % 255 for k in range(256))  # arbitrary data without a marker
 
 OrientationUse = Literal["turn", "ignore", "refuse"]
 """What is done with an image that states an orientation: turn its pixels, as OpenCV and FFmpeg do;
@@ -51,8 +51,8 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
     """Width and height of a JPEG or PNG file; None if the content is no complete file.
 
     The size is that of the image as OpenCV decodes it: rotated by a JPEG's Exif orientation. The
-    image's end must be there (anything may follow that of a JPEG), and enough data for its pixels.
-    Pixels are not decoded.
+    image's end must be there (anything may follow that of a JPEG), and in a JPEG a scan. Pixels are
+    not decoded.
     """
     if content.startswith(PNG_START):
         complete = content.endswith(PNG_END) and len(content) >= 33
@@ -86,27 +86,24 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
             raise DamagedImage("is cut off")
         if content[24:26] == b"\x10\0":
             raise DamagedImage("is a 16-bit grey PNG, as depth is; move depth files to depth/")
-        whole, orientation = content, _png_orientation(content)
+        whole, (orientation, _) = content, _exif_orientation(content.partition(b"eXIf")[2])
     elif content.startswith((*TIFF_STARTS, b"BM")):
         kind = "BMP" if content.startswith(b"BM") else "TIFF"
-        orientation = 1 if kind == "BMP" else _tiff_entry(content, 0x0112)[0]
+        orientation, _ = _exif_orientation(content)  # of a BMP: 1
         if kind == "BMP" and int.from_bytes(content[2:6], "little") > len(content):
             raise DamagedImage("is cut off")
-        if kind == "TIFF" and _tiff_entry(content, 0)[1]:
-            remarks.append("are followed by another image in the same file, which is not read")
         whole = encode_jpeg(_decode_8_bit(content))
         remarks.append(f"are {kind}, stored as JPEG of quality {JPEG_QUALITY}")
     elif content.startswith(JPEG_START):
         raise DamagedImage("is no whole JPEG")
     else:
         raise DamagedImage("is no whole JPEG, PNG, BMP or TIFF")
-    orientation = orientation if 1 <= orientation <= 8 else 1
     if orientation == 1:
         return whole, "; ".join(remarks)
     if orientation_use == "ignore":
-        if jpeg is not None:  # Exif orientation 1: as stored
+        if jpeg is not None:
             at = jpeg.orientation_at
-            whole = whole[:at] + b"\1" + whole[at + 1 :]
+            whole = whole[:at] + b"\1" + whole[at + 1 :]  # 1 = as stored
         elif content.startswith(PNG_START):
             whole = encode_jpeg(_decode_8_bit(content))
         remarks.append(
@@ -151,10 +148,10 @@ def _decode_8_bit(content: bytes) -> np.ndarray:
 
 
 def _parse_jpeg(content: bytes) -> _Jpeg | None:
-    """Parse the first image; None if it is none or holds too little data for its pixels."""
+    """Parse the first image; None if it is none or has no data."""
     if not content.startswith(JPEG_START):
         return None
-    at, data, needed = 2, 0, 0.0  # bytes
+    at, data = 2, 0  # bytes
     size: tuple[int, int] | None = None
     orientation, orientation_at = 1, 0
     end = len(content.rstrip(b"\0"))
@@ -172,40 +169,20 @@ def _parse_jpeg(content: bytes) -> _Jpeg | None:
             return None
         # Frame headers are C0 to CF except tables, reserved and arithmetic conditioning.
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            size, needed = _frame_header(marker, content[at + 2 : after])
+            height, width = struct.unpack(">HH", content[at + 3 : at + 7].ljust(4, b"\0"))
+            size = (width, height)
         if marker == 0xE1 and content[at + 2 : at + 8] == b"Exif\0\0":
-            orientation, where = _tiff_entry(content[at + 8 : after], 0x0112)
-            orientation = orientation if 1 <= orientation <= 8 else 1
-            orientation_at = at + 8 + where if where else 0
+            orientation, where = _exif_orientation(content[at + 8 : after])
+            orientation_at = at + 8 + where
         at = after
         if marker == 0xDA:  # a scan
             following = _MARKER.search(content, at)
             stop = len(content.rstrip(b"\0")) if following is None else following.start()
             data += max(0, stop - at)
             at = max(at, stop)
-    if size is None or min(size) < 1 or data < max(1, needed):
+    if size is None or min(size) < 1 or data < 1:
         return None
     return _Jpeg(size, orientation, orientation_at, end, ended)
-
-
-def _frame_header(marker: int, header: bytes) -> tuple[tuple[int, int] | None, float]:
-    """Width and height, and the least number of bytes that the image's blocks can have.
-
-    A block has at least a bit for its mean and, in sequential Huffman coding, one for its end.
-    """
-    if len(header) < 6 or len(header) < 6 + 3 * header[5]:
-        return None, 0.0
-    height, width = struct.unpack(">HH", header[1:5])
-    factors = [(sides >> 4, sides & 15) for sides in header[7 : 7 + 3 * header[5] : 3]]
-    most = [max((factor[axis] for factor in factors), default=0) for axis in (0, 1)]
-    bits = {0xC0: 2, 0xC1: 2, 0xC2: 1}.get(marker, 0)
-    if not all(most):
-        return (width, height), 0.0
-    blocks = sum(
-        -(-width * across // (8 * most[0])) * -(-height * down // (8 * most[1]))
-        for across, down in factors
-    )
-    return (width, height), blocks * bits / 8
 
 
 def _complete_jpeg(content: bytes) -> bytes:
@@ -219,36 +196,22 @@ def _complete_jpeg(content: bytes) -> bytes:
 def holds_all_pixels(content: bytes) -> bool:
     """Whether a file with an end is no JPEG, or a JPEG with data for all pixels.
 
-    Further data before the end marker do not change a complete image. Decodes the image twice, at
-    an eighth of its size.
+    A camera that loses data in its transfer still writes the end of the image. OpenCV then fills
+    the other pixels with grey; FFmpeg reports an error. The image is decoded at an eighth of its
+    size: 3 ms for 1920 x 1080.
     """
     if not content.startswith(JPEG_START):
         return True
-    flags = cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION
-    data = content.removesuffix(JPEG_END)
-    first, second = (
-        cv2.imdecode(np.frombuffer(data + tail + JPEG_END, np.uint8), flags)
-        for tail in (b"", _AFTER_A_CUT)
-    )
-    return first is not None and second is not None and np.array_equal(first, second)
+    decoder = av.CodecContext.create("mjpeg", "r")
+    decoder.options = {"err_detect": "explode", "lowres": "3"}
+    try:
+        return bool(decoder.decode(av.Packet(content)) + decoder.decode(None))
+    except av.error.FFmpegError:
+        return False
 
 
-def _png_orientation(content: bytes) -> int:
-    """Orientation of the chunk eXIf; 1 (as stored) without one."""
-    at = len(PNG_START)
-    while at + 12 <= len(content):
-        length, kind = struct.unpack(">I4s", content[at : at + 8])
-        if kind == b"eXIf":
-            return _tiff_entry(content[at + 8 : at + 8 + length], 0x0112)[0]
-        at += 12 + length
-    return 1
-
-
-def _tiff_entry(tiff: bytes, wanted: int) -> tuple[int, int]:
-    """Value of an entry of the first directory, and the offset of its low byte; (1, 0) without it.
-
-    For ``wanted`` 0, the second number is the offset of the next directory; 0 = none.
-    """
+def _exif_orientation(tiff: bytes) -> tuple[int, int]:
+    """Orientation, 1 to 8, and the offset of its low byte; (1, 0) without a valid entry."""
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     if order is None or len(tiff) < 10:
         return 1, 0
@@ -256,11 +219,8 @@ def _tiff_entry(tiff: bytes, wanted: int) -> tuple[int, int]:
     (entries,) = struct.unpack(f"{order}H", tiff[at : at + 2].ljust(2, b"\0"))
     for start in range(at + 2, min(at + 2 + 12 * entries, len(tiff) - 11), 12):
         tag, _, _, value = struct.unpack(f"{order}HHIH", tiff[start : start + 10])
-        if tag == wanted:
+        if tag == 0x0112 and 1 <= value <= 8:
             return value, start + (8 if order == "<" else 9)
-    if wanted == 0:
-        at += 2 + 12 * entries
-        return 1, struct.unpack(f"{order}I", tiff[at : at + 4].ljust(4, b"\0"))[0]
     return 1, 0
 
 

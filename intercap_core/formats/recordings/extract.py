@@ -23,10 +23,6 @@ from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
 
-# An image with less than this share of the bytes of the camera's largest one is decoded to see
-# whether it is complete. Decoding all would take longer than copying them.
-SHORT_IMAGE = 0.7
-
 
 def advice_on_size(actual: tuple[int, ...], expected: tuple[int, ...]) -> str:
     """Next step for images whose size (width, height) is not that of the calibration."""
@@ -146,7 +142,6 @@ class _Copy:
         self.offsets, self.buffer = [0], bytearray()
         self.measured = False  # whether any depth image holds a distance
         self.damaged = self.other_size = 0
-        self.longest = 0  # bytes of a colour image
 
     def run(self) -> None:
         """Copy all images, write their times and note missing or damaged data.
@@ -182,9 +177,7 @@ class _Copy:
                 return
             self._refuse("colour", size, self.colour_size, not self.colour_times)
             return
-        # A camera that loses data in its transfer still writes the end of the image.
-        self.longest = max(self.longest, len(content))
-        if len(content) < SHORT_IMAGE * self.longest and not holds_all_pixels(content):
+        if not holds_all_pixels(content):
             self.damaged += 1
             return
         self.colour_times.append(image.time_us)

@@ -54,10 +54,9 @@ class PlainLayout(RecordingLayout):
 
     def _size_of(self, name: str) -> tuple[int, int] | None:
         """Width and height of the camera's first image; None if none can be read."""
-        if name in self._folders and self._folders[name].colour:
-            return find_size(
-                self._folders[name].colour[:1]
-            )  # turned by Exif, as tools that state no size do
+        folder = self._folders.get(name)
+        if folder and folder.colour:
+            return find_size(folder.colour[:1])
         from intercap_core.formats.recordings.video import read_video_size
 
         return next((read_video_size(path) for path in self._videos if path.stem == name), None)
