@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     Field,
     field_validator,
 )
@@ -108,6 +109,12 @@ class ObjectTrackSettings(Model):
     """Device that renders the object; auto = cpu, and cuda is refused with an error."""
 
 
+def _packaged_definition(value: Any) -> Any:
+    """Return the packaged table of this name; any other value as it is."""
+    table = Path(__file__).parent / "body_fit/data" / f"{value}.tsv"
+    return table if isinstance(value, str) and value.isalnum() and table.is_file() else value
+
+
 class BodyFitSettings(Model):
     """SMPL-X parameters in every frame (equation 2)."""
 
@@ -121,10 +128,10 @@ class BodyFitSettings(Model):
     betas: Annotated[int, Field(ge=1, le=300)] = 10
     """Number of shape coefficients. Most readers of SMPL-X expect ten. The open body has 30, which
     reduce its distance to the data by about 4 %; a licensed file has up to 300."""
-    keypoint_definition: Path | None = None
-    """Table of the detector's joint positions on the body, written by ``intercap
-    keypoint-definition``. Without it, the fit estimates offsets with a standard deviation of 10 mm
-    from the body model's joints."""
+    keypoint_definition: Annotated[Path | None, BeforeValidator(_packaged_definition)] = None
+    """Table of the detector's joint positions on the body: a file that ``intercap
+    keypoint-definition`` wrote, or ``mediapipe`` for the packaged table. Without it, the fit
+    estimates offsets with a standard deviation of 10 mm from the body model's joints."""
     points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
     """Number of person points sampled from each frame's fused point cloud."""
     cloud_weight: Annotated[float, Field(gt=0, le=1000)] = 1.0

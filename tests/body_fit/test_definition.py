@@ -11,6 +11,7 @@ import torch
 
 from intercap_core.body_fit.definition import POINTS, UNKNOWN_SIGMA_M, Definition
 from intercap_core.body_fit.problem import ParameterLayout
+from intercap_core.config import BodyFitSettings
 from intercap_core.errors import UserError
 
 
@@ -31,6 +32,16 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_without_a_table_offsets_are_zero() -> None:
     found = Definition.read(None)
     assert not found.offsets.any() and (found.sigma == UNKNOWN_SIGMA_M).all()
+
+
+def test_the_packaged_table_is_found_by_its_name() -> None:
+    named = BodyFitSettings.model_validate({"keypoint_definition": "mediapipe"})
+    offsets = dict(zip(POINTS, Definition.read(named.keypoint_definition).offsets, strict=True))
+    # MediaPipe's ankle is above the model's on both sides, and an ear lies beside the head's joint
+    assert offsets["left_ankle"][1] > 0.01 and offsets["right_ankle"][1] > 0.01
+    assert offsets["left_ear"][0] < -0.02 < 0.02 < offsets["right_ear"][0]
+    own = BodyFitSettings.model_validate({"keypoint_definition": "lab/own.tsv"})
+    assert own.keypoint_definition == Path("lab/own.tsv")
 
 
 @pytest.mark.parametrize(
