@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core import schemas
+from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.output.release import manifest
 from intercap_core.pipeline.code_digest import code_digest
+from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, tidy
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.versions import versions
@@ -26,8 +28,10 @@ _PRINTED = 20  # paths of each kind of difference
 def write_release(project: Project, kinds: Sequence[str]) -> Path:
     """List the files of all results; returns the path of the list.
 
-    Warns if results come from several versions or settings. Raises UserError without results.
+    Warns if results come from several versions or settings. Raises UserError without results, and
+    if an output is damaged or missing.
     """
+    _check_complete(project)
     reported = {
         name: project.artefact(name, "summary")
         for name in project.sequences
@@ -45,10 +49,6 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
                 "project again before you release it",
                 stage, len(found), ", ".join(few["sequences"][:_PRINTED]),
             )  # fmt: skip
-    if "export" in kinds:
-        for name in reported:
-            if not (project.artefact(name, "export") / "export.json").is_file():
-                log.warning("sequence %s is released without its export", name)
     config = project.config
     entries = manifest.write(
         project.results,
@@ -91,6 +91,24 @@ def check_release(folder: Path) -> bool:
     wrong = len(found.missing) + len(found.changed)
     print(f"{folder}: {count - wrong} of {count} files are as released")
     return not found
+
+
+def _check_complete(project: Project) -> None:
+    """Raise UserError that names the sequences with damaged or missing outputs."""
+    plan = Plan(project)
+    faults = {name: list(plan.faults(name).values()) for name in ("", *project.sequences)}
+    broken = {name or "the dataset": found for name, found in faults.items() if found}
+    if not broken:
+        return
+    for name, found in broken.items():
+        log.warning("%s: %s", name, "; ".join(found))
+    names = sorted(broken)
+    more = f" and {len(names) - _PRINTED} more" if len(names) > _PRINTED else ""
+    raise UserError(
+        f"{project.results}: outputs of {', '.join(names[:_PRINTED])}{more} are damaged or "
+        f"missing, such as {broken[names[0]][0].partition(';')[0]}; nothing is released: run the "
+        "project again, or name the sequences in 'exclude'"
+    )
 
 
 def _made(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:

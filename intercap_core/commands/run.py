@@ -25,7 +25,7 @@ from intercap_core.commands.closing import print_remarks
 from intercap_core.disk import free_bytes
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
-from intercap_core.pipeline.lease import Lease, lease_path, try_acquire
+from intercap_core.pipeline.lease import Lease, find_snakemake, lease_path, try_acquire
 from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
 from intercap_core.signals import Terminated
@@ -73,13 +73,18 @@ def run_workflow(
     if DRY_RUN & set(arguments):
         command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
         return subprocess.call(command)
-    with _exclusive(project, settings, console):
+    if not arguments and Plan(project).all_done():
+        count = len(project.sequences)
+        console.print(f"nothing to do: all {count} sequences are done", highlight=False)
+        _print_report(project, console)
+        return 0
+    with _exclusive(project, console):
         return _run(project, settings, cores, profile, arguments, console)
 
 
 @contextmanager
-def _exclusive(project: Project, settings: Path, console: Console) -> Iterator[None]:
-    """Prevent a second run of the same results, and remove Snakemake's lock of a killed run.
+def _exclusive(project: Project, console: Console) -> Iterator[None]:
+    """Prevent a second run of the same results.
 
     Raises UserError that names the other run if there is one.
     """
@@ -87,14 +92,13 @@ def _exclusive(project: Project, settings: Path, console: Console) -> Iterator[N
     try:
         killed = lease.expired_owner
         if killed is not None and killed.host == socket.gethostname():
-            snakemake = _snakemake_here()
+            snakemake = find_snakemake(Path.cwd())
             if snakemake:
                 raise UserError(
                     f"{project.results}: the run by {killed} was killed, but its jobs are still "
                     f"running (their Snakemake is process {snakemake}); wait for them, or end them"
                 )
             console.print(f"the run by {killed} was killed: going on where it stopped")
-            _unlock(settings)
         elif killed is not None:
             console.print(f"the lease of the run by {killed} has expired: it is taken over")
         yield
@@ -126,19 +130,6 @@ def _acquire_run_lease(project: Project, console: Console) -> Lease:
         time.sleep(POLL_SECONDS)
 
 
-def _snakemake_here() -> int | None:
-    """Process id of a Snakemake that runs in this folder; None if there is none."""
-    import psutil
-
-    for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
-        words = process.info["cmdline"] or []
-        if "snakemake" in {Path(word).name for word in words[:3]} and process.info["cwd"] == str(
-            Path.cwd()
-        ):
-            return int(process.info["pid"])
-    return None
-
-
 def _run(
     project: Project,
     settings: Path,
@@ -151,11 +142,6 @@ def _run(
 
     If some sequences fail, the outputs of all sequences are made from the others.
     """
-    if not arguments and Plan(project).all_done():
-        count = len(project.sequences)
-        console.print(f"nothing to do: all {count} sequences are done", highlight=False)
-        _print_report(project, console)
-        return 0
     command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
     watcher = Watcher(project, console)
     try:
@@ -167,7 +153,6 @@ def _run(
             watcher = Watcher(project, console)
             status = run_watched(command, watcher, console)
     except Terminated as end:
-        _unlock(settings)
         words = f"{end}: {watcher.steps()} jobs are done; run the same command to continue"
         console.print(words, highlight=False, soft_wrap=True)
         printed = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -193,12 +178,6 @@ def _run(
     print_remarks(project, console)
     _print_report(project, console)
     return status
-
-
-def _unlock(settings: Path) -> None:
-    """Remove the lock of a Snakemake that this run has ended, unless another one is running."""
-    if any(Path(".snakemake/locks").glob("*")) and _snakemake_here() is None:
-        subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
 
 
 def _full_disk(project: Project) -> str:

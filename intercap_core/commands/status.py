@@ -12,11 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core.pipeline.checksums import find_damage
+from intercap_core.inputs.files import printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.plan import OutputState, OutputStatus, Plan
-from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.progress import Progress
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -195,18 +194,15 @@ def _to_json(current: Status) -> dict[str, object]:
 
 
 def print_verification(project: Project) -> bool:
-    """Read all data of every artefact and print the damaged ones; True if none is damaged."""
-    outputs = (project.artefact(name, stage) for name in project.sequences for stage in STAGES)
-    paths = [path for path in outputs if path.exists()]
-    damaged: list[str] = []
-    progress = Progress(log, "verified", len(paths), "files")
-    for path in paths:
-        damage = find_damage(path)
-        if not damage and read_manifest(path) is None:
-            damage = f"{path}: has no manifest, or a damaged one; delete it and run again"
-        damaged += [damage] if damage else []
+    """Read every output and print the damaged and missing ones; True if there are none."""
+    plan = Plan(project)
+    sequences = ["", *project.sequences]
+    progress = Progress(log, "verified", len(sequences), "sequences")
+    faults: list[str] = []
+    for name in sequences:
+        faults += plan.faults(name).values()
         progress.step()
-    for words in damaged:
-        print(words)
-    print(f"{len(paths)} outputs read, {len(damaged)} damaged")
-    return not damaged
+    for words in faults:
+        print(printable(words))
+    print(f"{len(project.sequences)} sequences read, {len(faults)} outputs damaged or missing")
+    return not faults

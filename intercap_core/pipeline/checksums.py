@@ -1,10 +1,11 @@
 """Checksums of input files and of outputs, computed again only if size or date has changed.
 
-A recording has gigabytes. The checksum of each input is stored with its size and date next to the
+A recording has gigabytes. The checksum of each input is stored with its size and dates next to the
 results of the sequence. A start with nothing to do therefore reads no recording; a touched or
-copied file is read once and makes nothing stale. The checksum and the manifest of each artefact are
-stored in the same way: another size or date shows that an artefact may be truncated or overwritten,
-and only then is it opened. All stored values may be lost without harm.
+copied file is read once and makes nothing stale. Outputs are treated alike: the manifest of a
+folder lists size and checksum of every file in it, and the checksum of an artefact is stored next
+to it. Only if size or date of a file has changed is it read and compared. All values stored next to
+outputs may be lost without harm.
 """
 
 from __future__ import annotations
@@ -13,19 +14,20 @@ import contextlib
 import hashlib
 import json
 import os
+import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import part_of
 from intercap_core.errors import UserError
-from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest
-from intercap_core.stage_list import STAGES
+from intercap_core.pipeline.provenance import FILE, Manifest, file_digest, read_manifest
 
 INPUTS_FILE = ".inputs.json"
 _SUFFIX = ".left"  # suffix of the file that stores the checksum of an output
+_STAMPS = f".files{_SUFFIX}"  # the same inside a folder, for the files of its manifest
 _MANIFEST = "manifest"  # key of the manifest in that file
-_MAX_LISTED = 200  # files of a folder up to which each file's size and date are compared
 _LARGE_BYTES = 100_000_000  # a larger file with another size counts as changed, unread
 _ROWS = 64  # rows read at a time, so that memory stays flat
 
@@ -39,7 +41,10 @@ class InputChecksums:
         self._changed = False
 
     def digest(self, path: Path, *, was: str | None = None) -> str:
-        """Checksum and size of a file or folder; "missing" if it does not exist.
+        """Checksum and size of a file or folder; "missing", "unreadable" or "no file" without them.
+
+        Pipes and devices are "no file"; they are not opened. The stage that reads the file reports
+        it.
 
         Args:
             was: earlier value; "changed" is returned without reading a large file if its size
@@ -47,18 +52,23 @@ class InputChecksums:
         """
         try:
             stamp, size = _input_stamp(path)
-        except OSError:
+        except (OSError, ValueError):
             return "missing"
+        if not stamp:
+            return "no file"
         known = self._known.get(str(path))
         if known is not None and known[0] == stamp:
             return known[1]
         if was is not None and size > _LARGE_BYTES and was.rpartition(":")[2] != str(size):
             return "changed"
-        checksum = _folder_digest(path) if path.is_dir() else _file_digest(path)[:16]
-        digest = f"{checksum}:{size}"
-        if stamp == _input_stamp(path)[0]:  # it did not change while it was read
-            self._known[str(path)] = [stamp, digest]
-            self._changed = True
+        try:
+            checksum = _folder_digest(path) if path.is_dir() else file_digest(path)[:16]
+            digest = f"{checksum}:{size}"
+            if stamp == _input_stamp(path)[0]:  # it did not change while it was read
+                self._known[str(path)] = [stamp, digest]
+                self._changed = True
+        except OSError:
+            return "unreadable"
         return digest
 
     def save(self) -> None:
@@ -69,84 +79,95 @@ class InputChecksums:
 
 
 def _input_stamp(path: Path) -> tuple[str, int]:
-    """Text that changes with a file or folder, and its size or number of files.
+    """Text that changes with a file, or with any file of a folder, and its size or their number.
 
-    Replaced files change the dates of their folders. Files overwritten in place are noticed only
-    in folders of up to ``_MAX_LISTED`` files.
+    The time of the last change of the inode shows a file that is rewritten with its old date. The
+    text is empty for pipes and devices.
     """
-    stat = path.stat()
-    if not path.is_dir():
-        return f"{stat.st_size} {stat.st_mtime_ns}", stat.st_size
+    status = path.stat()
+    if not stat.S_ISDIR(status.st_mode):
+        return _stat_text(status), status.st_size
     state, count = hashlib.sha256(), 0
-    for folder, folders, names in os.walk(path):
-        folders.sort()
-        state.update(f"{os.stat(folder).st_mtime_ns} {len(names)}\n".encode())
-        count += len(names)
-        for name in sorted(names) if len(names) <= _MAX_LISTED else ():
-            file = os.stat(Path(folder, name))
-            state.update(f"{name} {file.st_size} {file.st_mtime_ns}\n".encode())
+    for file in _files_below(os.fspath(path)):
+        with contextlib.suppress(OSError):  # a dangling link
+            state.update(os.fsencode(f"{file}\0{_stat_text(os.stat(file))}\n"))
+        count += 1
     return state.hexdigest()[:16], count
 
 
-def _file_digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _stat_text(status: os.stat_result) -> str:
+    if not stat.S_ISREG(status.st_mode):
+        return ""
+    return f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}"
+
+
+def _files_below(folder: str, above: tuple[tuple[int, int], ...] = ()) -> Iterator[str]:
+    """Paths below a folder that are no folders, sorted; links to folders are followed.
+
+    ``above``: device and inode of the folders above, to which a link may lead back.
+    """
+    status = os.stat(folder)
+    inode = (status.st_dev, status.st_ino)
+    if inode in above:
+        return
+    with os.scandir(folder) as scanned:
+        entries = sorted(scanned, key=lambda entry: entry.name)
+    for entry in entries:
+        if entry.is_dir():
+            yield from _files_below(entry.path, (*above, inode))
+        else:
+            yield entry.path
 
 
 def _folder_digest(path: Path) -> str:
+    """Digest of the names and contents of all files below a folder."""
     state = hashlib.sha256()
-    for folder, folders, names in os.walk(path):
-        folders.sort()
-        for name in sorted(names):
-            file = Path(folder, name)
-            if file.is_file():
-                relative = file.relative_to(path).as_posix()
-                state.update(f"{relative} {_file_digest(file)[:16]}\n".encode())
+    for file in _files_below(os.fspath(path)):
+        content = file_digest(Path(file))[:16] if os.path.isfile(file) else "no file"
+        state.update(os.fsencode(f"{os.path.relpath(file, path)} {content}\n"))
     return state.hexdigest()[:16]
 
 
 def forget_output(output: Path) -> None:
-    """Remove the stored checksum of an output, before another output takes its place."""
+    """Remove the stored checksum of an artefact, before another one takes its place."""
     _checksum_file(output).unlink(missing_ok=True)
 
 
 def remember_output(output: Path) -> None:
-    """Store size, date and checksum of a file; without effect if they cannot be stored."""
+    """Store size, date and checksum of an output; without effect if they cannot be stored."""
     with contextlib.suppress(OSError, artefacts.Unreadable):
-        values = {
-            output.name: [_output_stamp(output), _file_digest(output)],
-            _MANIFEST: [_manifest_text(output), ""],
-        }
+        values = {output.name: [_output_stamp(output), ""]}
+        if not output.is_dir():
+            values[output.name][1] = file_digest(output)
+            values[_MANIFEST] = [_manifest_text(output), ""]
         write_pairs(_checksum_file(output), values)
 
 
 def is_unchanged(output: Path) -> bool:
-    """Whether size and date of an output are the stored ones."""
+    """Whether size and date of an output, or of all files of a folder, are the stored ones."""
     try:
         stored = read_pairs(_checksum_file(output)).get(output.name, ["", ""])
         return stored[0] == _output_stamp(output)
-    except FileNotFoundError:
+    except OSError:
         return False
 
 
 def find_damage(output: Path) -> str:
-    """Read a whole artefact, or all files of an export; returns an error message, "" if intact.
+    """Read a whole output; returns an error message, "" if it is intact.
 
-    An artefact is intact if it has the stored checksum. If it is another artefact (with another
-    manifest) or no checksum is stored, the checksums inside the HDF5 file decide. Raises OSError if
-    the output cannot be read.
+    A folder is intact if it has the files of its manifest; an artefact, if it has the stored
+    checksum. If it is another artefact (with another manifest) or no checksum is stored, the
+    checksums inside the HDF5 file decide. Raises OSError if the output cannot be read.
     """
     if output.is_dir():
         return _find_damaged_file(output)
     stored = read_pairs(_checksum_file(output))
     try:
         if output.name in stored:
-            if _file_digest(output) == stored[output.name][1]:
+            if file_digest(output) == stored[output.name][1]:
                 return ""
             if stored.get(_MANIFEST, ["", ""])[0] == _manifest_text(output):
                 return f"{output}: is not as it was written; delete it and run again"
-        if output.suffix != ".h5":
-            return ""
         with artefacts.read(output, getattr(schemas, output.stem.upper())) as source:
             for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
                 shape, _, _, _ = source.describe(key)
@@ -158,47 +179,42 @@ def find_damage(output: Path) -> str:
 
 
 def _find_damaged_file(folder: Path) -> str:
-    """The first file of an export that differs from its checksum in the export's manifest."""
-    listing = folder / STAGES["export"].folder_marker
-    if not listing.is_file():
-        return ""
-    try:
-        listed = json.loads(listing.read_text(encoding="utf-8"))["files"]
-        damaged = [
-            name
-            for name, digest in listed.items()
-            if not (folder / name).is_file() or _file_digest(folder / name) != digest
-        ]
-    except (ValueError, KeyError, AttributeError, TypeError):
-        damaged = [listing.name]
-    if not damaged:
-        return ""
-    return (
-        f"{folder / damaged[0]}: is not as it was written; delete the folder and re-run its stage"
-    )
+    """The first file of a folder that differs from the folder's manifest."""
+    manifest = read_manifest(folder)
+    for name, listed in manifest.outputs.items() if manifest is not None else ():
+        file, size = folder / name, listed.rpartition(":")[2]
+        if not file.is_file():
+            found = "is missing"
+        elif str(file.stat().st_size) != size:
+            found = f"has {file.stat().st_size} bytes, it was written with {size}"
+        elif f"{file_digest(file)}:{size}" != listed:
+            found = "is not as it was written"
+        else:
+            continue
+        return f"{file}: {found}; run again"
+    return ""
 
 
 def read_valid_manifest(output: Path) -> Manifest | None:
-    """The manifest of an output; None if it has none or if the output is a damaged artefact.
+    """The manifest of an output; None if it has none or if the output is damaged.
 
-    An artefact is opened, and then read completely, only if its size or date differs from the
-    stored one. Raises UserError if the output cannot be read.
+    An output is read completely only if its size or date differs from the stored one. Raises
+    UserError if the output cannot be read.
     """
-    is_artefact = output.suffix == ".h5"
-    file = output if is_artefact else output / FILE
+    file = output if output.suffix == ".h5" else output / FILE
     try:
         file.open("rb").close()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         raise UserError(
             f"{file}: cannot be read ({error.strerror}); make it readable, or delete it, then run "
             "again"
         ) from None
-    if not is_artefact:
-        return read_manifest(output)
-    stored = read_pairs(_checksum_file(output))
-    if _MANIFEST in stored and is_unchanged(output):
+    if is_unchanged(output):
+        stored = read_pairs(_checksum_file(output))
+        if output.is_dir() or _MANIFEST not in stored:
+            return read_manifest(output)
         return Manifest.from_text(stored[_MANIFEST][0])
     manifest = read_manifest(output)
     if manifest is None or find_damage(output):
@@ -213,12 +229,22 @@ def _manifest_text(output: Path) -> str:
 
 
 def _checksum_file(output: Path) -> Path:
+    if output.is_dir():
+        return output / _STAMPS
     return output.with_name(f".{output.name}{_SUFFIX}")
 
 
 def _output_stamp(output: Path) -> str:
-    stat = output.stat()
-    return f"{stat.st_size} {stat.st_mtime_ns}"
+    """Size and date of an artefact; digest of those of the files that a folder's manifest lists."""
+    if not output.is_dir():
+        status = output.stat()
+        return f"{status.st_size} {status.st_mtime_ns}"
+    manifest = read_manifest(output)
+    state = hashlib.sha256()
+    for name in manifest.outputs if manifest is not None else ():
+        status = (output / name).stat()
+        state.update(f"{name} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return state.hexdigest()
 
 
 def read_pairs(path: Path) -> dict[str, list[str]]:

@@ -8,6 +8,7 @@ output in place, because it may have been suspended until its lease expired.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import json
 import logging
@@ -20,6 +21,8 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+import psutil
 
 from intercap_core import disk
 from intercap_core.errors import UserError
@@ -158,7 +161,7 @@ def lease_holder(output: Path) -> LeaseOwner | None:
 
 def _read_holder(path: Path) -> LeaseOwner | None:
     try:
-        age_s = abs(_file_system_time(path.parent) - path.stat().st_mtime)
+        age_s = abs(file_system_time(path.parent) - path.stat().st_mtime)
     except FileNotFoundError:
         return None
     return (_read_owner(path) or _UNKNOWN) if age_s < EXPIRES_S else None
@@ -171,7 +174,7 @@ def _read_owner(path: Path) -> LeaseOwner | None:
         return None
 
 
-def _file_system_time(folder: Path) -> float:
+def file_system_time(folder: Path) -> float:
     """Current time by the clock that dates files: that of a file server may differ from ours."""
     probe = folder / f".clock.{uuid.uuid4().hex}"
     try:
@@ -181,6 +184,46 @@ def _file_system_time(folder: Path) -> float:
     except OSError:
         return time.time()
     return now
+
+
+def remove_dead_lock(folder: Path) -> None:
+    """Remove Snakemake's lock from its ``folder`` if its owner was killed.
+
+    The owner writes a lease into the folder and keeps it until its process ends. The lock stays if
+    the lease has a heartbeat, or if another Snakemake or a job of one works in the same directory.
+    A lock without a lease is of another program and stays.
+    """
+    path = folder / "workflow.lease"
+    existed = path.exists()
+    owner = _read_owner(path)
+    if owner is not None and owner.host == socket.gethostname() and not _is_alive(owner.pid):
+        path.unlink(missing_ok=True)  # without waiting until it expires
+    lease = try_acquire(path)
+    if not isinstance(lease, Lease):
+        return
+    atexit.register(lease.release)
+    if existed and find_snakemake(folder.resolve().parent) is None:
+        for lock in (folder / "locks").glob("*.lock"):
+            lock.unlink(missing_ok=True)
+
+
+def find_snakemake(folder: Path) -> int | None:
+    """Process id of another Snakemake that works in ``folder``; None if there is none."""
+    own = {os.getpid(), *(parent.pid for parent in psutil.Process().parents())}
+    for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
+        words = process.info["cmdline"] or []
+        named = "snakemake" in {Path(word).name for word in words[:3]}
+        if named and process.info["cwd"] == str(folder) and process.info["pid"] not in own:
+            return int(process.info["pid"])
+    return None
+
+
+def _is_alive(pid: int) -> bool:
+    """Whether a process of this machine runs; a process that is ended but not reaped does not."""
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
 
 
 def _remove_parts(output: Path) -> None:

@@ -1,17 +1,15 @@
 """Decides which outputs are up to date, missing or stale, and thereby what a run computes.
 
 An output is up to date if its manifest has the fingerprint that the output would get now. Dates of
-files do not count, so results may be moved or copied. An
-artefact whose size or date differs from the stored ones is read through, and is stale if it is
-damaged. See docs/reruns.md.
+files do not count, so results may be moved or copied. An output whose sizes or dates differ from
+the stored ones is read through, and is stale if it is damaged. See docs/reruns.md.
 """
 
 from __future__ import annotations
 
 import os
-import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -22,11 +20,11 @@ from intercap_core.pipeline.checksums import (
     INPUTS_FILE,
     InputChecksums,
     find_damage,
-    is_unchanged,
     read_valid_manifest,
 )
 from intercap_core.pipeline.job import last_failure
-from intercap_core.pipeline.provenance import Manifest, read_manifest
+from intercap_core.pipeline.lease import file_system_time
+from intercap_core.pipeline.provenance import DATASET_OUTPUTS, FILE, Manifest, read_manifest
 from intercap_core.pipeline.stage_inputs import (
     STUDIO,
     dataset_manifest,
@@ -37,11 +35,9 @@ from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
 DATASET = "dataset"
-DATASET_OUTPUTS = (
-    "site/index.html", "summary.json", "heatmaps.h5", "tables", "card.md", "card.json",
-    "croissant.json",
-)  # fmt: skip
 MARKS = Path(".snakemake") / "out_of_date"
+_STALE_DATE = 315_532_800  # of stale outputs: 1980, the first year of all file systems
+_MARK_DATE = _STALE_DATE + 86_400
 
 
 class OutputStatus(StrEnum):
@@ -91,9 +87,7 @@ class Plan:
         files = [self.project.results / name for name in DATASET_OUTPUTS]
         if not all(file.exists() for file in files):
             return OutputState(OutputStatus.missing, (), current.fingerprint)
-        damaged = any(find_damage(file) for file in checked_files(files) if not is_unchanged(file))
-        manifest = None if damaged else read_manifest(self.project.results)
-        return _compare(self.project.results, manifest, current)
+        return _compare(self.project.results, read_valid_manifest(self.project.results), current)
 
     def output(self, sequence: str, stage: str) -> Path:
         """Path of the output of a stage, or of the studio."""
@@ -101,6 +95,28 @@ class Plan:
         if stage == STUDIO and recordings is not None:
             return recordings
         return self.project.artefact(sequence, stage)
+
+    def faults(self, sequence: str) -> dict[str, str]:
+        """Error message by stage of each damaged or missing output of a sequence, read completely.
+
+        Sequence "" stands for the outputs of all sequences. A sequence without any output has no
+        fault. Outputs count as missing if those of a later stage, or of all sequences, exist.
+        """
+        if not sequence:
+            exists = any((self.project.results / name).exists() for name in DATASET_OUTPUTS)
+            fault = _find_fault(self.project.results, "", DATASET) if exists else ""
+            return {DATASET: fault} if fault else {}
+        stages = list(STAGES)
+        if self.project.recordings_made(sequence) is not None:
+            stages = [STUDIO, *stages]
+        existing = [stage for stage in stages if self.output(sequence, stage).exists()]
+        if existing and not (self.project.results / FILE).exists():
+            stages = stages[: stages.index(existing[-1]) + 1]
+        faults = {
+            stage: _find_fault(self.output(sequence, stage), sequence, stage)
+            for stage in (stages if existing else ())
+        }
+        return {stage: fault for stage, fault in faults.items() if fault}
 
     def all_done(self) -> bool:
         """Whether every output of the project is up to date."""
@@ -128,37 +144,46 @@ class Plan:
         return self._annotation_faults.get(sequence, "")
 
     def mark(self, sequence: str, stage: str) -> list[Path]:
-        """Write the mark of a stale output, a file that is newer than the output.
+        """Path of the mark of a stale output, in a list; [] if the output is not stale.
 
-        Returns a list of its path; [] if the output is not stale. Snakemake runs the job of an
-        existing output only because of its mark: without one, the dates of all inputs are ignored.
+        A mark is a file that is newer than the output. Snakemake runs the job of an existing output
+        only because of its mark: without one, the dates of all inputs are ignored.
         """
-        path = mark_of(self.project, sequence, stage)
-        if not self.is_stale(sequence, stage):
-            return []
-        output = self.project.site / "index.html"
-        if stage != DATASET:
-            output = self.output(sequence, stage)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        newest = max([file.stat().st_mtime for file in _dated_files(output)], default=0.0)
-        if not path.is_file() or path.stat().st_mtime <= newest:
-            # a unique content, in case Snakemake compares checksums of inputs
-            lines = [*self._state(sequence, stage).reasons, uuid.uuid4().hex]
-            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-            # seconds; less than any job takes, whose output must be newer than the mark
-            later = max(newest, time.time()) + 0.1
-            os.utime(path, (later, later))
-        return [path]
+        return [mark_of(self.project, sequence, stage)] if self.is_stale(sequence, stage) else []
 
     def mark_all(self) -> None:
-        """Write the marks of all stale outputs.
+        """Write the marks of all stale outputs, and give outputs dated ahead the current time.
 
-        Snakemake lists their folder once and treats files that are written later as missing.
+        Snakemake lists the folder of the marks once and treats files that are written later as
+        missing. After a job, it refuses outputs that are older than an input. Marks and stale
+        outputs therefore get dates of long ago: the clocks of machines and file servers differ.
         """
-        for name in self.project.sequences:
-            for stage in self.states(name):
-                self.mark(name, stage)
-        self.mark("", DATASET)
+        outputs = [(name, stage) for name in self.project.sequences for stage in self.states(name)]
+        existing = self.project.results.is_dir()
+        now = file_system_time(self.project.results) if existing else 0.0
+        for name, stage in (*outputs, ("", DATASET)):
+            for path in self.mark(name, stage):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                # a unique content, in case Snakemake compares checksums of inputs
+                lines = [*self._state(name, stage).reasons, uuid.uuid4().hex]
+                path.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
+                os.utime(path, (_MARK_DATE, _MARK_DATE))
+            stale = self.is_stale(name, stage)
+            for file in self._dated_files(name, stage):
+                if stale:
+                    os.utime(file, (_STALE_DATE, _STALE_DATE))
+                elif file.stat().st_mtime > now:
+                    os.utime(file)
+
+    def _dated_files(self, sequence: str, stage: str) -> list[Path]:
+        """Existing files and folders whose date Snakemake may take for that of an output."""
+        if stage == DATASET:
+            paths = [self.project.results / name for name in DATASET_OUTPUTS]
+        else:
+            paths = [self.output(sequence, stage)]
+        names = (".snakemake_timestamp", "capture.json", "truth.h5")
+        paths += [path / name for path in paths if path.is_dir() for name in names]
+        return [path for path in paths if path.exists()]
 
     def _state(self, sequence: str, stage: str) -> OutputState:
         return self.dataset if stage == DATASET else self.states(sequence)[stage]
@@ -235,9 +260,22 @@ def failures(project: Project) -> dict[str, str]:
     return {name: reason for name, reason in reasons.items() if reason}
 
 
-def checked_files(files: Iterable[Path]) -> list[Path]:
-    """The existing files outside the site among ``files``: checksums are stored of these only."""
-    return [file for file in files if file.parent.name != "site" and file.is_file()]
+def _find_fault(output: Path, sequence: str, stage: str) -> str:
+    """Read an output; returns an error message if it is missing or damaged, otherwise ""."""
+    if not output.exists():
+        return f"{output}: is missing; run again"
+    manifest = read_manifest(output)
+    if manifest is not None and (manifest.sequence, manifest.stage) != (sequence, stage):
+        made = f"{manifest.stage} of {manifest.sequence or 'all sequences'}"
+        return f"{output}: was made as {made}; delete it and run again"
+    damage = find_damage(output)
+    if damage:
+        return damage
+    if manifest is None:
+        return f"{output}: has no manifest, or a damaged one; delete it and run again"
+    if output.is_dir() and not manifest.outputs:
+        return f"{output}: has no list of its files; delete it and run again"
+    return ""
 
 
 def mark_of(project: Project, sequence: str, stage: str) -> Path:
@@ -263,9 +301,3 @@ def _compare(path: Path, before: Manifest | None, current: Manifest) -> OutputSt
 
 def _machine(machine: Mapping[str, str]) -> str:
     return f"{machine.get('device', 'cpu')}, {machine.get('cpu', 'unknown')}"
-
-
-def _dated_files(output: Path) -> list[Path]:
-    """Files whose date Snakemake may take for that of an output."""
-    names = (".snakemake_timestamp", "capture.json", "truth.h5")
-    return [path for path in (output, *(output / name for name in names)) if path.exists()]

@@ -12,7 +12,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,6 +26,12 @@ LIBRARIES = (
 )  # fmt: skip
 FILE = ".made_from.json"  # manifest of a folder, inside it
 FORMAT = 1
+DATASET_OUTPUTS = (
+    "site/index.html", "summary.json", "heatmaps.h5", "tables", "card.md", "card.json",
+    "croissant.json",
+)  # fmt: skip
+_PAGES = "sequences"  # folder of the sequences' pages in the site
+_NOT_COMPARED = ("machine", "outputs")
 _MAX_CHANGES = 3  # changed values named in one reason
 _MAX_VALUE_LENGTH = 60  # characters of a value in a reason
 
@@ -50,11 +56,15 @@ class Manifest:
     """Versions of the libraries that influence numerical results."""
     machine: Mapping[str, str] = field(default_factory=dict)
     """Device and processor; reported, not part of the fingerprint."""
+    outputs: Mapping[str, str] = field(default_factory=dict)
+    """Checksum and size of each file of a folder, by relative path; not part of the fingerprint."""
 
     @property
     def fingerprint(self) -> str:
-        """Digest of everything but the machine; equal for outputs that can replace each other."""
-        compared = {name: value for name, value in asdict(self).items() if name != "machine"}
+        """Digest of what it was made from; equal for outputs that can replace each other."""
+        compared = {
+            name: value for name, value in asdict(self).items() if name not in _NOT_COMPARED
+        }
         return hashlib.sha256(_json(compared).encode()).hexdigest()[:24]
 
     def to_text(self) -> str:
@@ -76,7 +86,8 @@ class Manifest:
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
         maps = (
-            manifest.given, manifest.files, manifest.artefacts, manifest.code, manifest.libraries
+            manifest.given, manifest.files, manifest.artefacts, manifest.code, manifest.libraries,
+            manifest.outputs,
         )  # fmt: skip
         return manifest if all(isinstance(entries, dict) for entries in maps) else None
 
@@ -113,13 +124,41 @@ def read_manifest(output: Path) -> Manifest | None:
 
 
 def write_manifest(output: Path, manifest: Manifest) -> None:
-    """Add the manifest to an artefact or folder that is otherwise complete."""
+    """Add the manifest to an artefact or folder that is otherwise complete.
+
+    That of a folder lists its files.
+    """
     if output.is_dir():
         part = output / f"{FILE}.part"
-        part.write_text(manifest.to_text(), encoding="utf-8")
+        listed = replace(manifest, outputs=_list_files(output, manifest.stage))
+        part.write_text(listed.to_text(), encoding="utf-8")
         os.replace(part, output / FILE)
     else:
         artefacts.put_made_from(output, manifest.to_text())
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _list_files(folder: Path, stage: str) -> dict[str, str]:
+    """Checksum and size of the files that a stage wrote into ``folder``, without hidden ones.
+
+    The folder of the dataset's outputs also holds those of all sequences, which are left out.
+    """
+    tops = [folder]
+    if stage == "dataset":
+        tops = [folder / name for name in (*DATASET_OUTPUTS, "site")]
+    files = {}
+    for top in tops:
+        for path in [top] if top.is_file() else sorted(top.rglob("*")):
+            name = path.relative_to(folder).as_posix()
+            hidden = any(part.startswith(".") for part in Path(name).parts)
+            if path.is_file() and not hidden and not name.startswith(f"site/{_PAGES}/"):
+                files[name] = f"{file_digest(path)}:{path.stat().st_size}"
+    return files
 
 
 @cache

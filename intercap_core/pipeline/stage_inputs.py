@@ -6,9 +6,13 @@ setting, table entry or annotation that its manifest does not record.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+import mmap
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from pydantic import BaseModel
 
@@ -28,6 +32,7 @@ from intercap_core.stage_list import STAGES
 from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
+_REFERRING = {".obj", ".mtl", ".ply", ".glb", ".onnx"}  # suffixes of files that name other files
 
 
 def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
@@ -92,7 +97,7 @@ def stage_manifest(
 
 
 def files_read(project: Project, sequence: str, stage: str) -> list[Path]:
-    """The user's files whose checksums the manifest of the stage's output holds."""
+    """The user's files and folders whose checksums the manifest of the stage's output holds."""
     given = _given(project, sequence, stage, Annotation())
     return [path for value in given.values() for path in _split_paths(value)[1].values()]
 
@@ -140,10 +145,9 @@ def dataset_manifest(
     given = {
         "settings": project.config.card,
         "formats": project.config.export.formats,
-        "body_models": project.config.body_models.model_dump(mode="json"),
+        "body_models": _without_folders(project.config.body_models),
         "objects": {
-            name: project.objects[name].model_dump(mode="json", exclude={"mesh"})
-            for name in project.objects_named()
+            name: _without_folders(project.objects[name]) for name in project.objects_named()
         },
         "failed": dict(failed),
         "changed": changed(project.config),
@@ -203,6 +207,12 @@ def _split_paths(value: Any) -> tuple[Any, dict[str, Path]]:
     return value, {}
 
 
+def _without_folders(entry: BaseModel) -> dict[str, Any]:
+    """Values of an entry; of paths only the names, so that a moved project stays up to date."""
+    names = {name: value.name for name, value in entry if isinstance(value, Path)}
+    return entry.model_dump(mode="json", exclude=set(names)) | names
+
+
 def _split_row(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
     """Columns of a row, and its files; recordings by the files of their layout."""
     values, paths = {}, {}
@@ -223,9 +233,45 @@ def _split_row(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
 
 
 def _companion_files(path: Path) -> list[Path]:
-    """Files read together with another: materials and texture of a mesh, maps of a body."""
+    """Files read together with another: those that it names, textures of a mesh, maps of a body."""
     names = (f"{path.stem}.mtl", f"{path.stem}.png", f"{path.stem}.jpg", f"{path.stem}_maps.json")
-    return [file for name in names if (file := path.with_name(name)).is_file()]
+    files = [file for name in names if (file := path.with_name(name)).is_file()]
+    for file in (path, *files):
+        if file.suffix.lower() in _REFERRING and file.is_file():
+            status = file.stat()
+            stamp = (status.st_size, status.st_mtime_ns, path.parent.stat().st_mtime_ns)
+            files += _files_named_in(file, stamp)
+    return sorted({file for file in files if file != path})
+
+
+@functools.cache
+def _files_named_in(path: Path, stamp: tuple[int, ...]) -> list[Path]:
+    """Files next to ``path``, or below, whose names its content holds, and those named in these.
+
+    Covers materials and textures of a mesh and external weights of an ONNX model without a parser
+    of each format. ``stamp`` is that of the file, for the cache.
+    """
+    found: dict[Path, None] = {path: None}
+    for file in iter(waiting := [path]):
+        if file.suffix.lower() in _REFERRING and file.stat().st_size:
+            with (
+                open(file, "rb") as opened,
+                mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content,
+            ):
+                new = [named for named in _named_below(file.parent, content) if named not in found]
+            found |= dict.fromkeys(new)
+            waiting += new
+    return list(found)[1:]
+
+
+def _named_below(folder: Path, content: mmap.mmap) -> Iterator[Path]:
+    for entry in os.scandir(folder):
+        names = {os.fsencode(entry.name), quote(os.fsencode(entry.name)).encode()}
+        if any(content.find(name) >= 0 for name in names):
+            if entry.is_dir(follow_symlinks=False):
+                yield from _named_below(folder / entry.name, content)
+            elif entry.is_file():
+                yield folder / entry.name
 
 
 def _body_files(config: Config, gender: str) -> BodyModels:

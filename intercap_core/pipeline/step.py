@@ -24,7 +24,7 @@ from intercap_core.pipeline.checksums import (
 )
 from intercap_core.pipeline.code_digest import stage_code
 from intercap_core.pipeline.lease import Lease, acquire
-from intercap_core.pipeline.plan import DATASET, DATASET_OUTPUTS, checked_files, failures
+from intercap_core.pipeline.plan import DATASET, failures
 from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest, write_manifest
 from intercap_core.pipeline.resources import explain_disk_errors
 from intercap_core.project import Project
@@ -151,7 +151,7 @@ class _Step:
             else:
                 forget_output(self.output)
                 os.replace(part, self.output)
-                remember_output(self.output)
+            remember_output(self.output)
             return True
         finally:
             if in_folder:
@@ -230,6 +230,7 @@ def run_studio(project: Project, sequence: str) -> Path:
             output=folder,
         )
         write_manifest(folder, manifest)
+        remember_output(folder)
     return folder
 
 
@@ -258,8 +259,6 @@ def run_dataset(project: Project) -> Path:
     )
     with explain_disk_errors(project, folder / DATASET), acquire(folder / DATASET):
         (folder / FILE).unlink(missing_ok=True)
-        for name in DATASET_OUTPUTS:
-            forget_output(folder / name)
         first = dataset.run(
             dataset=project.config.dataset,
             summaries={name: project.artefact(name, "summary") for name in project.sequences},
@@ -273,7 +272,6 @@ def run_dataset(project: Project) -> Path:
             changed=changed(project.config),
         )
         write_manifest(folder, current)
-        for file in checked_files(folder / name for name in DATASET_OUTPUTS):
-            remember_output(file)
+        remember_output(folder)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,10 @@ from intercap_core.pipeline.checksums import (
     find_damage,
     forget_output,
     is_unchanged,
+    read_valid_manifest,
     remember_output,
 )
+from intercap_core.pipeline.provenance import Manifest, write_manifest
 
 WRITES = """
 import resource, sys
@@ -125,15 +127,35 @@ def test_flipped_bits_and_truncation_are_detected(summary: Path, share: float) -
     assert "delete" in find_damage(summary)
 
 
-def test_a_changed_file_of_an_export_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (lambda file: file.write_bytes(b"numb"), "has 4 bytes, it was written with 7"),
+        (lambda file: file.write_bytes(b"NUMBERS"), "is not as it was written"),
+        (lambda file: file.unlink(), "is missing"),
+        (lambda file: (file.unlink(), file.mkdir()), "is missing"),
+        (lambda file: (file.unlink(), file.symlink_to("none")), "is missing"),
+        (lambda file: file.write_bytes(b""), "has 0 bytes, it was written with 7"),
+    ],
+)
+def test_a_damaged_file_of_a_folder_is_named(
+    tmp_path: Path, fault: Callable[[Path], object], words: str
+) -> None:
     folder = tmp_path / "export"
-    folder.mkdir()
-    (folder / "res.pkl").write_bytes(b"numbers")
-    digest = "2bcd5ff1ab4c3bb3ff8a3ab8c86a0c4e37cbb2f4ea8b9f2f6d9f5e3c4b2a1d0e"
-    (folder / "export.json").write_text(json.dumps({"files": {"res.pkl": digest}}))
-    assert "res.pkl: is not as it was written" in find_damage(folder)
-    (folder / "export.json").write_text(json.dumps({"files": {}}))
-    assert find_damage(folder) == ""
+    (folder / "amass").mkdir(parents=True)
+    file = folder / "amass" / "body.npz"
+    file.write_bytes(b"numbers")
+    made = Manifest("export", "s01", {}, {}, {}, {}, {})
+    write_manifest(folder, made)
+    remember_output(folder)
+    found = read_valid_manifest(folder)
+    assert found is not None and found.fingerprint == made.fingerprint
+    assert find_damage(folder) == "" and is_unchanged(folder)
+    os.utime(file, (1.0, 1.0))
+    assert read_valid_manifest(folder) == found and is_unchanged(folder)
+    fault(file)
+    assert find_damage(folder) == f"{file}: {words}; run again"
+    assert read_valid_manifest(folder) is None
 
 
 def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:
@@ -184,8 +206,8 @@ def test_inputs_are_read_once_and_by_size_and_date(
     digest = inputs.digest(file)
     inputs.save()
     reads: list[Path] = []
-    take = checksums._file_digest
-    monkeypatch.setattr(checksums, "_file_digest", lambda path: reads.append(path) or take(path))
+    take = checksums.file_digest
+    monkeypatch.setattr(checksums, "file_digest", lambda path: reads.append(path) or take(path))
     again = InputChecksums(store)
     assert again.digest(file) == digest and reads == []
     file.touch()
@@ -213,3 +235,66 @@ def test_digest_of_a_folder_follows_its_files(tmp_path: Path) -> None:
     assert first != second and inputs.digest(folder) == first
     (folder / "colour" / "00001.jpg").write_bytes(b"uno")  # in place
     assert inputs.digest(folder) != first
+
+
+def _rewrite(path: Path, content: bytes) -> None:
+    """Overwrite in place with the size and dates of before."""
+    before = path.stat()
+    assert len(content) == before.st_size
+    time.sleep(0.01)  # a tick of the clock that dates files
+    path.write_bytes(content)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["one of many", "file behind a link", "folder behind a link", "dangling link", "retargeted"],
+)
+def test_any_changed_file_of_a_folder_changes_the_digest(tmp_path: Path, change: str) -> None:
+    """The file is rewritten in place, with its old size and date."""
+    folder, outside = tmp_path / "k1", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    for number in range(250):
+        (folder / f"{number:05}.jpg").write_bytes(b"one")
+    (outside / "a.jpg").write_bytes(b"one")
+    (outside / "b.jpg").write_bytes(b"two")
+    (folder / "file").symlink_to(outside / "a.jpg")
+    (folder / "others").symlink_to(outside)
+    (folder / "none").symlink_to(tmp_path / "none")
+    (folder / "back").symlink_to(folder)
+    inputs = InputChecksums(tmp_path / ".inputs.json")
+    before = inputs.digest(folder)
+    assert ":" in before and inputs.digest(folder) == before
+    match change:
+        case "one of many":
+            _rewrite(folder / "00200.jpg", b"uno")
+        case "file behind a link":
+            _rewrite(outside / "a.jpg", b"uno")
+        case "folder behind a link":
+            _rewrite(outside / "b.jpg", b"due")
+        case "dangling link":
+            (tmp_path / "none").write_bytes(b"there")
+        case "retargeted":
+            (folder / "file").unlink()
+            (folder / "file").symlink_to(outside / "b.jpg")
+    assert inputs.digest(folder) != before
+
+
+def test_pipes_devices_and_odd_names_are_digested_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    inputs = InputChecksums(tmp_path / "s01" / ".inputs.json")
+    (tmp_path / "s01").mkdir()
+    assert inputs.digest(tmp_path / "pipe") == inputs.digest(Path("/dev/zero")) == "no file"
+    folder = tmp_path / "keypoints"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe")
+    odd = Path(os.fsdecode(os.fsencode(folder) + b"/caf\xe9.json"))
+    odd.write_bytes(b"{}")
+    before = inputs.digest(folder)
+    assert ":" in before and ":" in inputs.digest(odd)
+    odd.write_bytes(b"[]")
+    assert inputs.digest(folder) != before
+    inputs.save()
+    assert InputChecksums(tmp_path / "s01" / ".inputs.json").digest(odd) == inputs.digest(odd)
+    assert inputs.digest(tmp_path / "a\0b") == inputs.digest(tmp_path / ("x" * 300)) == "missing"

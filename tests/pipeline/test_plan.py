@@ -6,7 +6,9 @@ tests/workflow checks that Snakemake follows the plan.
 
 from __future__ import annotations
 
+import os
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +16,11 @@ import h5py
 import pytest
 import yaml
 
-from intercap_core.commands.status import print_status
+from intercap_core.commands.status import print_status, print_verification
 from intercap_core.pipeline import checksums
 from intercap_core.pipeline.checksums import remember_output
-from intercap_core.pipeline.plan import DATASET_OUTPUTS, OutputStatus, Plan
-from intercap_core.pipeline.provenance import read_manifest, write_manifest
+from intercap_core.pipeline.plan import OutputStatus, Plan, mark_of
+from intercap_core.pipeline.provenance import DATASET_OUTPUTS, read_manifest, write_manifest
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 from tests.helpers.flow import ONE, OTHER
@@ -72,13 +74,16 @@ def _write(path: Path) -> None:
         path.touch()
     else:
         path.mkdir()
+        (path / "index.html").touch()
 
 
 def _bring_up_to_date(project: Project) -> None:
     rewrite_manifests(project)
-    for path in [*project.results.rglob("*.h5"), *project.results.glob("*.*")]:
-        if path.is_file():
-            remember_output(path)
+    for name in project.sequences:
+        for stage in STAGES:
+            remember_output(project.artefact(name, stage))
+        remember_output(project.results / "recordings" / name)
+    remember_output(project.results)
 
 
 def _pending() -> set[tuple[str, str]]:
@@ -222,8 +227,8 @@ def test_of_a_sequence_without_results_no_recording_is_read(
 
     shutil.rmtree(folder / "results" / "test" / ONE)
     shutil.rmtree(folder / "results" / "test" / "site")
-    digest = checksums._file_digest
-    monkeypatch.setattr(checksums, "_file_digest", never)
+    digest = checksums.file_digest
+    monkeypatch.setattr(checksums, "file_digest", never)
     plan = Plan(load_project(SETTINGS))
     states = {stage: state.status for stage, state in plan.states(ONE).items()}
     assert states.pop("studio") is OutputStatus.done
@@ -245,3 +250,117 @@ def test_companion_files_of_a_mesh_count(folder: Path) -> None:
     plan = Plan(load_project(SETTINGS))
     (reason,) = plan.states(OTHER)["studio"].reasons
     assert f"mesh/{mesh.stem}.mtl" in reason
+
+
+@pytest.mark.parametrize(
+    ("file", "pending"),
+    [
+        ("site/index.html", DATASET),
+        ("summary.json", DATASET),
+        ("heatmaps.h5", DATASET),
+        ("tables/frames.csv", DATASET),
+        (f"{ONE}/export/amass/body.npz", _of(ONE, "export")),
+        (f"site/sequences/{ONE}/viewer/data.bin", _of(ONE, "page")),
+        (f"recordings/{OTHER}/k1.mkv", _of(OTHER, "studio", *STAGES) | DATASET),
+    ],
+)
+def test_a_cut_or_missing_file_of_any_output_is_made_again(
+    folder: Path, file: str, pending: set[tuple[str, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = load_project(SETTINGS)
+    path = project.results / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix != ".h5":
+        path.write_bytes(b"content")
+    _bring_up_to_date(project)
+    assert _pending() == set() and print_verification(project)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert _pending() == pending
+    capsys.readouterr()
+    assert not print_verification(project)
+    assert f"{path}: has " in capsys.readouterr().out
+    path.unlink()
+    assert _pending() == pending
+    assert not print_verification(project)
+    assert f"{path}: is missing" in capsys.readouterr().out
+
+
+def test_an_output_of_another_sequence_is_no_output(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = load_project(SETTINGS)
+    shutil.copy(project.artefact(OTHER, "joint"), project.artefact(ONE, "joint"))
+    assert not print_verification(project)
+    assert f"was made as joint of {OTHER}" in capsys.readouterr().out
+
+
+def test_files_that_a_mesh_names_count(folder: Path) -> None:
+    """Also through another file, in a folder, with an encoded name."""
+    mesh = load_project(SETTINGS).objects["cup"].mesh
+    (mesh.parent / "maps").mkdir()
+    with mesh.open("ab") as file:
+        file.write(b"comment TextureFile red.mtl\n")
+    (mesh.parent / "red.mtl").write_text("map_Kd maps\\red%20one.png\n")
+    texture = mesh.parent / "maps" / "red one.png"
+    for content in ("red", "blue"):
+        texture.write_text(content)
+        (reason,) = [
+            reason
+            for reason in Plan(load_project(SETTINGS)).states(OTHER)["studio"].reasons
+            if content == "blue"
+        ] or [""]
+        if content == "red":
+            _bring_up_to_date(load_project(SETTINGS))
+            assert _pending() == set()
+    assert "mesh/red one.png has another content" in reason
+
+
+def test_external_weights_of_a_model_count(folder: Path) -> None:
+    model = folder / SETTINGS.parent / "model.onnx"
+    model.write_bytes(b"\x0a\x08location\x12\x0bweights.bin")
+    model.with_name("weights.bin").write_bytes(b"one")
+    _set(folder, detections={"segmentation_model": model.name})
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    model.with_name("weights.bin").write_bytes(b"two")
+    stages = {"detections", *AFTER_SCENE}
+    assert _pending() == _of(ONE, *stages) | _of(OTHER, *stages) | DATASET
+
+
+def test_a_moved_project_stays_up_to_date(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The body model, the meshes and the settings lie outside the working directory."""
+    settings = folder / SETTINGS
+    text = settings.read_text()
+    shutil.copy(settings, settings.with_name("body.npz"))
+    settings.write_text(f"{text}\nbody_models: {{neutral: {settings.with_name('body.npz')}}}\n")
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    moved = tmp_path / "elsewhere" / "deeper"
+    moved.parent.mkdir()
+    monkeypatch.chdir(tmp_path)
+    folder.rename(moved)
+    monkeypatch.chdir(moved)
+    settings = moved / SETTINGS
+    settings.write_text(f"{text}\nbody_models: {{neutral: {settings.with_name('body.npz')}}}\n")
+    assert _pending() == set()
+
+
+def test_no_output_or_mark_is_dated_ahead_of_the_clock(folder: Path) -> None:
+    """Snakemake refuses an output that is older than an input, and removes it."""
+    project = load_project(SETTINGS)
+    ahead = time.time() + 7200
+    for path in project.results.rglob("*"):
+        os.utime(path, (ahead, ahead))
+    _set(folder, joint={"ground_weight": 2.0})
+    plan = Plan(load_project(SETTINGS))
+    plan.mark_all()
+    assert plan.is_stale(ONE, "joint") and not plan.is_stale(ONE, "body_fit")
+    for name in project.sequences:
+        for stage in plan.states(name):
+            output = plan.output(name, stage)
+            assert output.stat().st_mtime <= time.time()
+            for mark in plan.mark(name, stage):
+                assert mark == mark_of(project, name, stage)
+                assert output.stat().st_mtime < mark.stat().st_mtime < time.time()

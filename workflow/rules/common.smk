@@ -8,6 +8,7 @@ from snakemake.utils import update_config
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import read_yaml
 from intercap_core.pipeline.code_digest import stage_code
+from intercap_core.pipeline.lease import remove_dead_lock
 from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.pipeline.stage_inputs import files_read
 from intercap_core.pipeline.resources import (
@@ -20,6 +21,7 @@ from intercap_core.pipeline.resources import (
 )
 from intercap_core.project import load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES, Extent
+from snakemake_executor_plugin_intercap_slurm.ledger import stamp
 
 
 def _load():
@@ -43,6 +45,7 @@ SEQUENCES = list(PROJECT.sequences)
 PLAN = Plan(PROJECT)
 if workflow.is_main_process:
     try:
+        remove_dead_lock(Path(".snakemake"))
         PLAN.mark_all()
     except (UserError, OSError) as error:
         raise WorkflowError(str(error)) from None
@@ -115,18 +118,18 @@ def inputs_of(stage):
 
 
 def files_of(stage):
-    """Input function: the user's files that a stage reads, without those of the studio.
+    """Param: path, size and date of the user's files that a stage reads, without the studio's.
 
-    Missing ones are left out; the job that reads them reports them. Their dates are ignored, but
-    the executor for Slurm adopts no job whose files have changed.
+    The executor for Slurm adopts no job whose files have changed. They are no inputs: Snakemake
+    fails the job of an input that is dated ahead of the clock and removes its output.
     """
 
     def files(wildcards):
         made = PROJECT.recordings_made(wildcards.sequence)
         return [
-            path
+            f"{path} {stamp(path)}"
             for path in files_read(PROJECT, wildcards.sequence, stage)
-            if path.exists() and (made is None or not path.is_relative_to(made))
+            if made is None or not path.is_relative_to(made)
         ]
 
     return files

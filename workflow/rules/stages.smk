@@ -6,7 +6,6 @@ for _stage in STAGES.values():
             _stage.name
         input:
             unpack(inputs_of(_stage.name)),
-            files=ancient(files_of(_stage.name)),
             annotation=ancient(annotation_input),
             mark=out_of_date(_stage.name),
         output:
@@ -24,6 +23,7 @@ for _stage in STAGES.values():
             runtime=duration(_stage.name),
         params:
             identity=identity_of(_stage.name),
+            files=files_of(_stage.name),
         message:
             f"{{wildcards.sequence}}: {_stage.name} ({_stage.purpose})"
         script:
