@@ -363,7 +363,7 @@ class Artefact:
             if key not in self._datasets:
                 self._datasets[key] = self._file[key]
             values = self._datasets[key][selection]
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, TypeError, AttributeError) as error:  # or it is a group
             raise self._damaged(
                 f"dataset {key!r} is damaged (its checksum does not match)"
             ) from error
@@ -383,7 +383,7 @@ class Artefact:
                 str(_value(dataset.attrs.get("units", ""))),
                 str(_value(dataset.attrs.get("frame", ""))),
             )
-        except (OSError, RuntimeError, ValueError, TypeError) as error:
+        except (OSError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             raise self._damaged(f"dataset {key!r} is damaged") from error
 
     def _damaged(self, what: str) -> Unreadable:

@@ -5,6 +5,7 @@ Commands import numerical libraries themselves, so that `--help` answers at once
 
 from __future__ import annotations
 
+import io
 import sys
 import time
 from collections.abc import Callable
@@ -703,11 +704,14 @@ def main() -> None:
 
     A signal exits with the status that shells expect, 128 plus its number.
     """
+    for stream in (sys.stdout, sys.stderr):  # terminals of other encodings, names that are no text
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         with raise_on_signals():
             app()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error.shortened()}", file=sys.stderr)
         raise SystemExit(1) from None
     except Terminated as end:
         print(f"{end}: incomplete outputs are removed; run again to continue", file=sys.stderr)

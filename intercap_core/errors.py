@@ -8,3 +8,10 @@ class UserError(Exception):
     what was expected, and ends with the next step. The command line and the workflow scripts
     print it without a traceback.
     """
+
+    def shortened(self, most: int = 2000) -> str:
+        """The message, without its middle if it has more than ``most`` characters."""
+        text = str(self)
+        if len(text) <= most:
+            return text
+        return f"{text[: most // 2]} [...] {text[-most // 2 :]}"

@@ -109,7 +109,7 @@ class Project:
             look_at_frames: compare the entries with the frames artefact, if it exists.
         """
         path = self.annotation_path(sequence)
-        if not path.exists():
+        if not os.path.lexists(path):
             if path == self.sequences[sequence].annotation:
                 raise UserError(
                     f"{path}: no such file, but sequence {sequence!r} names it in the column "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import tokenize
 import zipfile
@@ -75,7 +76,7 @@ def read_arrays(
         if wanted is not None and name not in wanted:
             continue
         try:
-            arrays[name] = _array(archive.read(entry))
+            arrays[name] = _array(archive, entry)
         except _ARCHIVE_ERRORS as error:
             reason = " ".join(printable(str(error)).split())[:200] or type(error).__name__
             words = f"has no readable array {name!r:.60} ({reason})"
@@ -83,9 +84,26 @@ def read_arrays(
     return arrays
 
 
-def _array(content: bytes) -> np.ndarray:
-    """Return the array of an .npy file's content."""
-    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    """Return an array of an archive, unpacked into its memory without another copy.
+
+    zipfile bounds the memory of stored and deflated entries only, which are those of numpy.
+    """
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        method = zipfile.compressor_names.get(entry.compress_type, str(entry.compress_type))
+        raise ValueError(f"it is packed by {method:.20}, expected deflate as numpy does")
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read_header(file)
+        if math.prod(shape) * dtype.itemsize > entry.file_size:
+            raise ValueError(f"its header states {shape} of {dtype}, which it does not hold")
+    with archive.open(entry) as file:
+        array = np.lib.format.read_array(file, allow_pickle=False)
     if array.dtype.kind not in "biufcSU":
         raise ValueError(f"it holds {array.dtype}, expected numbers")
     return array

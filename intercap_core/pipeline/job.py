@@ -66,8 +66,8 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
             yield
         logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
     except UserError as error:
-        logger.error("%s %s", FAILED, error)
-        _print_error(f"{name} failed: {error}")
+        logger.error("%s %s", FAILED, error.shortened())
+        _print_error(f"{name} failed: {error.shortened()}")
         raise SystemExit(1) from None
     except Terminated as end:
         logger.error("%s %s, %s", FAILED, ENDED, end)

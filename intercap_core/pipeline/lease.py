@@ -22,8 +22,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import psutil
-
 from intercap_core import disk
 from intercap_core.errors import UserError
 
@@ -198,7 +196,10 @@ def remove_dead_lock(folder: Path) -> None:
     owner = _read_owner(path)
     if owner is not None and owner.host == socket.gethostname() and not _is_alive(owner.pid):
         path.unlink(missing_ok=True)  # without waiting until it expires
-    lease = try_acquire(path)
+    try:
+        lease = try_acquire(path)
+    except UserError:  # a folder that is only read
+        return
     if not isinstance(lease, Lease):
         return
     atexit.register(lease.release)
@@ -209,6 +210,8 @@ def remove_dead_lock(folder: Path) -> None:
 
 def find_snakemake(folder: Path) -> int | None:
     """Process id of another Snakemake that works in ``folder``; None if there is none."""
+    import psutil
+
     own = {os.getpid(), *(parent.pid for parent in psutil.Process().parents())}
     for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
         words = process.info["cmdline"] or []
@@ -220,6 +223,8 @@ def find_snakemake(folder: Path) -> int | None:
 
 def _is_alive(pid: int) -> bool:
     """Whether a process of this machine runs; a process that is ended but not reaped does not."""
+    import psutil
+
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
+import subprocess
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
+from intercap_core.pipeline.lease import LeaseOwner
 from tests.chaos.victim import Victim, damage, different, kill_in
 from tests.helpers.cluster_run import contents
 from tests.helpers.flow import ONE, OTHER, Flow
@@ -71,3 +75,25 @@ def test_a_terminated_run_reports_once_and_leaves_no_parts(victim: Victim, numbe
     log = (victim.logs / ONE / "person.log").read_text()
     assert log.rstrip().splitlines()[-1].partition("failed: ")[2].startswith("unexpected end")
     assert victim.left_over() == [] and not victim.flow.artefact(ONE, "person").exists()
+
+
+def test_plain_snakemake_continues_after_a_killed_one(victim: Victim) -> None:
+    """Its lock is removed; inputs and results are dated ahead of the clock."""
+    whole = contents(victim.flow.results)
+    ahead = time.time() + 7200
+    for path in [*victim.flow.results.rglob("*"), *(victim.flow.folder / "config").rglob("*.*")]:
+        os.utime(path, (ahead, ahead))
+    damage(victim.flow.artefact(ONE, "metrics"))
+    folder = victim.flow.folder / ".snakemake"
+    (folder / "locks").mkdir(parents=True, exist_ok=True)
+    (folder / "locks" / "0.output.lock").write_text("\n".join(map(str, whole)))
+    metrics = victim.flow.artefact(ONE, "metrics").relative_to(victim.flow.folder)
+    (folder / "locks" / "1.output.lock").write_text(f"{metrics}\n")
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    owner = replace(LeaseOwner.current(), pid=ended.pid)
+    (folder / "workflow.lease").write_text(json.dumps(asdict(owner)))
+    done = victim.flow.run()
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert different(contents(victim.flow.results), whole) == []
+    assert not (folder / "workflow.lease").exists()

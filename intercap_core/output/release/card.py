@@ -7,6 +7,7 @@ dataset hubs read.
 from __future__ import annotations
 
 import hashlib
+import html
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,6 +32,7 @@ Facts = dict[str, Any]
 
 _TEMPLATES = Path(__file__).parent / "data"
 _NUMBER = re.compile(r"\d+(\.\d+)?")  # replaced in reasons, which are counted without numbers
+_MARKUP = re.compile(r"[\\`*\[\]!]")  # characters that begin markup within a line of Markdown
 _MAX_REASONS = 12  # most frequent reasons of flags
 # Size categories of dataset hubs: upper limit in frames, name
 _SIZES = (
@@ -148,9 +150,16 @@ def markdown(card: Facts) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["plain"] = _escape
     frames = card["counts"]["frames"]
     size = next((name for most, name in _SIZES if frames < most), "n>10M")
     return environment.get_template("card.md.j2").render(card=card, size=size)
+
+
+def _escape(text: str) -> str:
+    """First line of a text of artefacts or logs, with the characters of markup escaped."""
+    line = (str(text).splitlines() or [""])[0].replace("|", "/")
+    return _MARKUP.sub(r"\\\g<0>", html.escape(line, quote=False))
 
 
 def _splits(measured: Sequence[SequenceMetrics], settings: CardSettings) -> tuple[Split, Split]:
