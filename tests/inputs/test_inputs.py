@@ -206,6 +206,15 @@ def test_the_unpacked_size_of_an_archive_is_limited(tmp_path: Path) -> None:
     assert read_arrays(path)["zeros"].shape == (1 << 20,)
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_methods_that_unpack_without_a_limit_are_refused(method: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("values.npy", _head("(1000,)") + bytes(8000))
+    with pytest.raises(UnreadableFile, match="expected deflate"):
+        read_arrays(path)
+
+
 def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path) -> None:
     values = {
         "a": np.arange(6, dtype=">i4").reshape(2, 3),

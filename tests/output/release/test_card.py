@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from intercap_core.config import CardSettings
+from intercap_core.output.release.card import markdown
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.site import merge, write_summaries
 
@@ -91,6 +92,15 @@ def test_markdown_has_a_head_that_hubs_read(folder: Path) -> None:
         if line.startswith("|"):
             assert line.endswith("|") and line.count("|") >= 3
     assert "s02_o01: k2.mkv: cut\n" in body and "nan" not in body.lower().split()
+
+
+def test_texts_of_artefacts_are_no_markup(folder: Path) -> None:
+    card = json.loads((folder / "card.json").read_text())
+    hostile = "<img src=x> [a](http://b) ![c](d) `e` **f** | g\n# h"
+    card["flagged"]["reasons"] = [{"reason": hostile, "frames": 1}]
+    text = markdown(card)
+    line = r"&lt;img src=x&gt; \[a\](http://b) \!\[c\](d) \`e\` \*\*f\*\* / g"
+    assert f"| {line} | 1 |\n" in text and "# h" not in text
 
 
 def test_without_a_licence_the_card_says_so(
