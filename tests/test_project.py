@@ -284,6 +284,13 @@ def test_tables_may_start_with_a_byte_order_mark(folder: Path) -> None:
     assert set(load_project(Path("config.yaml")).subjects) == {"s01", "s02"}
 
 
+@pytest.mark.parametrize("target", ["nowhere.yaml", "/dev/zero", "."])
+def test_an_annotation_that_is_a_link_to_no_file_is_refused(folder: Path, target: str) -> None:
+    (folder / "annotations" / "one.yaml").symlink_to(target)
+    with pytest.raises(UserError, match=r"annotations/one\.yaml"):
+        load_project(Path("config.yaml")).annotation("one")
+
+
 def test_a_row_can_name_its_annotation(folder: Path) -> None:
     table = folder / "sequences.tsv"
     lines = table.read_text().splitlines()

@@ -89,8 +89,8 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
     zipfile bounds the memory of stored and deflated entries only, which are those of numpy.
     """
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        method = zipfile.compressor_names.get(entry.compress_type, str(entry.compress_type))
-        raise ValueError(f"it is packed by {method:.20}, expected deflate as numpy does")
+        method = entry.compress_type  # 12 is bzip2, 14 is LZMA
+        raise ValueError(f"it is packed by method {method}, expected deflate as numpy does")
     with archive.open(entry) as file:
         array = np.lib.format.read_array(file, allow_pickle=False)
     if array.dtype.kind not in "biufcSU":
