@@ -16,7 +16,9 @@ import h5py
 import pytest
 import yaml
 
+from intercap_core.commands.release import write_release
 from intercap_core.commands.status import print_status, print_verification
+from intercap_core.errors import UserError
 from intercap_core.pipeline import checksums
 from intercap_core.pipeline.checksums import remember_output
 from intercap_core.pipeline.plan import OutputStatus, Plan, mark_of
@@ -364,3 +366,20 @@ def test_no_output_or_mark_is_dated_ahead_of_the_clock(folder: Path) -> None:
             for mark in plan.mark(name, stage):
                 assert mark == mark_of(project, name, stage)
                 assert output.stat().st_mtime < mark.stat().st_mtime < time.time()
+
+
+@pytest.mark.parametrize("fault", ["cut", "missing", "whole output missing"])
+def test_a_release_refuses_damaged_and_incomplete_sequences(folder: Path, fault: str) -> None:
+    project = load_project(SETTINGS)
+    page = project.artefact(OTHER, "page")
+    (page / "index.html").write_text("page")
+    _bring_up_to_date(project)
+    if fault == "cut":
+        (page / "index.html").write_text("pa")
+    elif fault == "missing":
+        (page / "index.html").unlink()
+    else:
+        shutil.rmtree(page)
+    with pytest.raises(UserError, match=rf"outputs of {OTHER} are damaged or missing"):
+        write_release(project, ["card"])
+    assert not (project.results / "release.json").exists()
