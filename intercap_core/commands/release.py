@@ -28,19 +28,12 @@ _PRINTED = 20  # paths of each kind of difference
 def write_release(project: Project, kinds: Sequence[str]) -> Path:
     """List the files of all results; returns the path of the list.
 
-    Warns if results come from several versions or settings. Raises UserError without results, and
-    if an output is damaged or missing.
+    Warns if results come from several versions or settings. Raises UserError if an output of a
+    sequence, or of the dataset, is damaged or missing.
     """
     _check_complete(project)
-    reported = {
-        name: project.artefact(name, "summary")
-        for name in project.sequences
-        if project.artefact(name, "summary").is_file()
-    }
-    for name in sorted(set(project.sequences) - set(reported)):
-        log.warning("sequence %s is not released: it has no results", name)
-    summaries = [SequenceSummary.read(path) for path in reported.values()]
-    made = _made(summaries)
+    names = list(project.sequences)
+    made = _made([SequenceSummary.read(project.artefact(name, "summary")) for name in names])
     for stage, found in made.items():
         if len(found) > 1:
             few = min(found, key=lambda version: len(version["sequences"]))
@@ -56,16 +49,16 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
             "dataset": config.dataset,
             "version": config.card.version,
             "licence": config.card.licence,
-            "sequences": sorted(reported),
+            "sequences": sorted(names),
             "software": dict(versions()),
             "schemas": {name: getattr(schemas, name.upper()).version for name in SEQUENCE_STAGES},
             "code": {name: code_digest(f"stages.{name}") for name in STAGES},
             "made_by": made,
             "settings": _without_folders(config.model_dump(mode="json", exclude={"studio"})),
-            "inputs": _inputs(project, list(reported)),
+            "inputs": _inputs(project, names),
         },
         kinds=kinds,
-        sequences=list(reported),
+        sequences=names,
         threads=os.cpu_count() or 1,
     )
     total = sum(entry.bytes for entry in entries)
@@ -96,8 +89,14 @@ def check_release(folder: Path) -> bool:
 def _check_complete(project: Project) -> None:
     """Raise UserError that names the sequences with damaged or missing outputs."""
     plan = Plan(project)
-    faults = {name: list(plan.faults(name).values()) for name in ("", *project.sequences)}
-    broken = {name or "the dataset": found for name, found in faults.items() if found}
+    broken = {}
+    for name in ("", *project.sequences):
+        faults = [*plan.faults(name).values()]
+        last = project.artefact(name, "summary") if name else project.site / "index.html"
+        if not faults and not last.exists():
+            faults = [f"{last}: is missing; run again"]
+        if faults:
+            broken[name or "the dataset"] = faults
     if not broken:
         return
     for name, found in broken.items():

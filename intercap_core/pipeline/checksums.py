@@ -179,19 +179,18 @@ def find_damage(output: Path) -> str:
 
 
 def _find_damaged_file(folder: Path) -> str:
-    """The first file of a folder that differs from the folder's manifest."""
+    """Error message about the first file that differs from the folder's manifest, "" if none."""
     manifest = read_manifest(folder)
-    for name, listed in manifest.outputs.items() if manifest is not None else ():
+    if manifest is None or not manifest.outputs:  # or an earlier version wrote it
+        return f"{folder / FILE}: is no list of the folder's files; run again"
+    for name, listed in manifest.outputs.items():
         file, size = folder / name, listed.rpartition(":")[2]
         if not file.is_file():
-            found = "is missing"
-        elif str(file.stat().st_size) != size:
-            found = f"has {file.stat().st_size} bytes, it was written with {size}"
-        elif f"{file_digest(file)}:{size}" != listed:
-            found = "is not as it was written"
-        else:
-            continue
-        return f"{file}: {found}; run again"
+            return f"{file}: is missing; run again"
+        if str(file.stat().st_size) != size:
+            return f"{file}: has {file.stat().st_size} bytes, it was written with {size}; run again"
+        if f"{file_digest(file)}:{size}" != listed:
+            return f"{file}: is not as it was written; delete it and run again"
     return ""
 
 

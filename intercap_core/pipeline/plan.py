@@ -36,8 +36,7 @@ from intercap_core.stage_list import STAGES
 
 DATASET = "dataset"
 MARKS = Path(".snakemake") / "out_of_date"
-_STALE_DATE = 315_532_800  # of stale outputs: 1980, the first year of all file systems
-_MARK_DATE = _STALE_DATE + 86_400
+_MARK_DELAY_S = 0.1  # date of a mark after that of its output; less than any job takes
 
 
 class OutputStatus(StrEnum):
@@ -155,25 +154,25 @@ class Plan:
         """Write the marks of all stale outputs, and give outputs dated ahead the current time.
 
         Snakemake lists the folder of the marks once and treats files that are written later as
-        missing. After a job, it refuses outputs that are older than an input. Marks and stale
-        outputs therefore get dates of long ago: the clocks of machines and file servers differ.
+        missing. After a job, it removes outputs that are older than an input. The date of a mark
+        therefore follows from that of its output and not from a clock: the clocks of machines and
+        file servers differ.
         """
         outputs = [(name, stage) for name in self.project.sequences for stage in self.states(name)]
         existing = self.project.results.is_dir()
         now = file_system_time(self.project.results) if existing else 0.0
         for name, stage in (*outputs, ("", DATASET)):
+            dated = self._dated_files(name, stage)
+            for file in dated:
+                if file.stat().st_mtime > now:
+                    os.utime(file)
             for path in self.mark(name, stage):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 # a unique content, in case Snakemake compares checksums of inputs
                 lines = [*self._state(name, stage).reasons, uuid.uuid4().hex]
                 path.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
-                os.utime(path, (_MARK_DATE, _MARK_DATE))
-            stale = self.is_stale(name, stage)
-            for file in self._dated_files(name, stage):
-                if stale:
-                    os.utime(file, (_STALE_DATE, _STALE_DATE))
-                elif file.stat().st_mtime > now:
-                    os.utime(file)
+                date = max([file.stat().st_mtime for file in dated], default=0.0) + _MARK_DELAY_S
+                os.utime(path, (date, date))
 
     def _dated_files(self, sequence: str, stage: str) -> list[Path]:
         """Existing files and folders whose date Snakemake may take for that of an output."""
@@ -267,15 +266,11 @@ def _find_fault(output: Path, sequence: str, stage: str) -> str:
     manifest = read_manifest(output)
     if manifest is not None and (manifest.sequence, manifest.stage) != (sequence, stage):
         made = f"{manifest.stage} of {manifest.sequence or 'all sequences'}"
-        return f"{output}: was made as {made}; delete it and run again"
+        return f"{output}: was made as {made}; run again"
     damage = find_damage(output)
-    if damage:
-        return damage
-    if manifest is None:
-        return f"{output}: has no manifest, or a damaged one; delete it and run again"
-    if output.is_dir() and not manifest.outputs:
-        return f"{output}: has no list of its files; delete it and run again"
-    return ""
+    if manifest is None and not damage:
+        return f"{output}: has no manifest, or a damaged one; run again"
+    return damage
 
 
 def mark_of(project: Project, sequence: str, stage: str) -> Path:

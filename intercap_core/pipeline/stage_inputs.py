@@ -6,8 +6,8 @@ setting, table entry or annotation that its manifest does not record.
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import mmap
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -33,6 +33,7 @@ from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
 _REFERRING = {".obj", ".mtl", ".ply", ".glb", ".onnx"}  # suffixes of files that name other files
+_SEARCHED_BYTES = 1 << 26  # at the beginning of such a file; a graph without weights has less
 
 
 def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
@@ -197,7 +198,7 @@ def _split_paths(value: Any) -> tuple[Any, dict[str, Path]]:
     if isinstance(value, BaseModel):
         named = {name: entry for name, entry in value if isinstance(entry, Path)}
         paths = {
-            f"{name}/{path.name}": path
+            f"{name}/{os.path.relpath(path, entry.parent)}": path
             for name, entry in named.items()
             for path in (entry, *_companion_files(entry))
         }
@@ -251,27 +252,26 @@ def _files_named_in(path: Path, stamp: tuple[int, ...]) -> list[Path]:
     Covers materials and textures of a mesh and external weights of an ONNX model without a parser
     of each format. ``stamp`` is that of the file, for the cache.
     """
-    found: dict[Path, None] = {path: None}
-    for file in iter(waiting := [path]):
-        if file.suffix.lower() in _REFERRING and file.stat().st_size:
-            with (
-                open(file, "rb") as opened,
-                mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content,
-            ):
-                new = [named for named in _named_below(file.parent, content) if named not in found]
-            found |= dict.fromkeys(new)
-            waiting += new
-    return list(found)[1:]
+    found = [path]
+    for file in found:  # which grows
+        if file.suffix.lower() in _REFERRING:
+            with contextlib.suppress(OSError), open(file, "rb") as opened:
+                content = opened.read(_SEARCHED_BYTES)
+                found += [
+                    named for named in _named_below(file.parent, content) if named not in found
+                ]
+    return found[1:]
 
 
-def _named_below(folder: Path, content: mmap.mmap) -> Iterator[Path]:
+def _named_below(folder: Path, content: bytes) -> Iterator[Path]:
+    """Files below ``folder`` whose names, and those of the folders between, ``content`` holds."""
     for entry in os.scandir(folder):
-        names = {os.fsencode(entry.name), quote(os.fsencode(entry.name)).encode()}
-        if any(content.find(name) >= 0 for name in names):
-            if entry.is_dir(follow_symlinks=False):
-                yield from _named_below(folder / entry.name, content)
-            elif entry.is_file():
-                yield folder / entry.name
+        name, path = os.fsencode(entry.name), folder / entry.name
+        if name in content or quote(name).encode() in content:
+            if entry.is_file():
+                yield path
+            elif entry.is_dir() and not folder.resolve().is_relative_to(path.resolve()):
+                yield from _named_below(path, content)
 
 
 def _body_files(config: Config, gender: str) -> BodyModels:

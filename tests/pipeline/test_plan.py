@@ -22,7 +22,7 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline import checksums
 from intercap_core.pipeline.checksums import remember_output
 from intercap_core.pipeline.plan import OutputStatus, Plan, mark_of
-from intercap_core.pipeline.provenance import DATASET_OUTPUTS, read_manifest, write_manifest
+from intercap_core.pipeline.provenance import DATASET_OUTPUTS, FILE, read_manifest, write_manifest
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 from tests.helpers.flow import ONE, OTHER
@@ -314,7 +314,7 @@ def test_files_that_a_mesh_names_count(folder: Path) -> None:
         if content == "red":
             _bring_up_to_date(load_project(SETTINGS))
             assert _pending() == set()
-    assert "mesh/red one.png has another content" in reason
+    assert "mesh/maps/red one.png has another content" in reason
 
 
 def test_external_weights_of_a_model_count(folder: Path) -> None:
@@ -383,3 +383,58 @@ def test_a_release_refuses_damaged_and_incomplete_sequences(folder: Path, fault:
     with pytest.raises(UserError, match=rf"outputs of {OTHER} are damaged or missing"):
         write_release(project, ["card"])
     assert not (project.results / "release.json").exists()
+
+
+def test_a_folder_without_a_list_of_its_files_is_made_again(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As versions wrote them that listed no files."""
+    project = load_project(SETTINGS)
+    _bring_up_to_date(project)
+    for output in (project.artefact(ONE, "page"), project.results):
+        manifest = read_manifest(output)
+        assert manifest is not None
+        (output / FILE).write_text(replace(manifest, outputs={}).to_text())
+    assert _pending() == _of(ONE, "page") | DATASET
+    assert not print_verification(project)
+    printed = capsys.readouterr().out
+    assert printed.count("is no list of the folder's files; run again") == 2
+    assert "delete" not in printed
+
+
+def test_marking_changes_no_date_of_an_output(folder: Path) -> None:
+    """The results may belong to another user, and a changed date has them read again."""
+    project = load_project(SETTINGS)
+    _set(folder, joint={"ground_weight": 2.0})
+    before = {path: path.stat().st_mtime_ns for path in project.results.rglob("*.h5")}
+    Plan(load_project(SETTINGS)).mark_all()
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_a_release_refuses_a_sequence_without_results(folder: Path) -> None:
+    project = load_project(SETTINGS)
+    _bring_up_to_date(project)
+    shutil.rmtree(project.results / ONE)
+    shutil.rmtree(project.artefact(ONE, "page"))
+    with pytest.raises(UserError, match=rf"outputs of {ONE} are damaged or missing"):
+        write_release(project, ["card"])
+
+
+def test_files_of_equal_names_in_folders_behind_links_count(folder: Path) -> None:
+    mesh = load_project(SETTINGS).objects["cup"].mesh
+    outside = folder / "textures"
+    for name in ("inner", "outer"):
+        (outside / name).mkdir(parents=True)
+        (outside / name / "map.png").write_text("red")
+    (outside / "outer" / "inner").symlink_to(mesh.parent)  # back, without an end
+    (mesh.parent / "inner").symlink_to(outside / "inner")
+    (mesh.parent / "outer").symlink_to(outside / "outer")
+    with mesh.open("ab") as file:
+        file.write(b"comment TextureFile inner/map.png\ncomment TextureFile outer/map.png\n")
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    for name in ("inner", "outer"):
+        (outside / name / "map.png").write_text("blue")
+        (reason,) = Plan(load_project(SETTINGS)).states(OTHER)["studio"].reasons
+        assert f"{name}/map.png has another content" in reason
+        _bring_up_to_date(load_project(SETTINGS))
