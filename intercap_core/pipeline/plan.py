@@ -36,7 +36,7 @@ from intercap_core.stage_list import STAGES
 
 DATASET = "dataset"
 MARKS = Path(".snakemake") / "out_of_date"
-_MARK_DELAY_S = 0.1  # date of a mark after that of its output; less than any job takes
+_MARK_DELAY_NS = 1_000_000  # date of a mark after that of its output; less than any job takes
 
 
 class OutputStatus(StrEnum):
@@ -171,8 +171,8 @@ class Plan:
                 # a unique content, in case Snakemake compares checksums of inputs
                 lines = [*self._state(name, stage).reasons, uuid.uuid4().hex]
                 path.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
-                date = max([file.stat().st_mtime for file in dated], default=0.0) + _MARK_DELAY_S
-                os.utime(path, (date, date))
+                date = max([file.stat().st_mtime_ns for file in dated], default=0) + _MARK_DELAY_NS
+                os.utime(path, ns=(date, date))
 
     def _dated_files(self, sequence: str, stage: str) -> list[Path]:
         """Existing files and folders whose date Snakemake may take for that of an output."""

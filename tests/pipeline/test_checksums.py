@@ -130,12 +130,12 @@ def test_flipped_bits_and_truncation_are_detected(summary: Path, share: float) -
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (lambda file: file.write_bytes(b"numb"), "has 4 bytes, it was written with 7"),
-        (lambda file: file.write_bytes(b"NUMBERS"), "is not as it was written"),
-        (lambda file: file.unlink(), "is missing"),
-        (lambda file: (file.unlink(), file.mkdir()), "is missing"),
-        (lambda file: (file.unlink(), file.symlink_to("none")), "is missing"),
-        (lambda file: file.write_bytes(b""), "has 0 bytes, it was written with 7"),
+        (lambda file: file.write_bytes(b"numb"), "has 4 bytes, it was written with 7;"),
+        (lambda file: file.write_bytes(b"NUMBERS"), "is not as it was written; delete it and"),
+        (lambda file: file.unlink(), "is missing;"),
+        (lambda file: (file.unlink(), file.mkdir()), "is missing;"),
+        (lambda file: (file.unlink(), file.symlink_to("none")), "is missing;"),
+        (lambda file: file.write_bytes(b""), "has 0 bytes, it was written with 7;"),
     ],
 )
 def test_a_damaged_file_of_a_folder_is_named(
@@ -154,7 +154,7 @@ def test_a_damaged_file_of_a_folder_is_named(
     os.utime(file, (1.0, 1.0))
     assert read_valid_manifest(folder) == found and is_unchanged(folder)
     fault(file)
-    assert find_damage(folder) == f"{file}: {words}; run again"
+    assert find_damage(folder) == f"{file}: {words} run again"
     assert read_valid_manifest(folder) is None
 
 
