@@ -333,18 +333,14 @@ class Artefact:
         self.attributes = {k: _value(v) for k, v in file.attrs.items() if k != MADE_FROM}
 
     def __contains__(self, key: str) -> bool:
-        return key in self._datasets or key in self._file
+        return key in self._datasets or isinstance(self._file.get(key), h5py.Dataset)
 
     def keys(self, prefix: str = "") -> list[str]:
         """Sorted names of the datasets that begin with ``prefix``."""
         names: list[str] = []
-
-        def is_dataset(name: str) -> bool:
-            return name in self._datasets or isinstance(self._file[name], h5py.Dataset)
-
         try:
             self._file.visit(names.append)
-            return sorted(name for name in names if name.startswith(prefix) and is_dataset(name))
+            return sorted(name for name in names if name.startswith(prefix) and name in self)
         except (OSError, RuntimeError, KeyError, ValueError) as error:
             raise self._damaged("its list of datasets is damaged") from error
 

@@ -225,6 +225,9 @@ def test_rows_are_streamed(tmp_path: Path) -> None:
         assert len(stream) == 5
     with artefacts.read(path, SCHEMA) as source:
         np.testing.assert_array_equal(source["cameras/k1/depth"], depth)
+        assert "cameras/k1" not in source
+        with pytest.raises(Unreadable, match="dataset 'cameras/k1' is missing"):
+            source["cameras/k1"]
 
 
 @settings(max_examples=25, deadline=None)

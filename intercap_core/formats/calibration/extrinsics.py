@@ -119,9 +119,23 @@ def _read_release_folder(folder: Path) -> Extrinsics:
                 "this camera again"
             )
         check_distance(path, "the camera", translation)
-        camera_from_world = rigid(Rotation.from_rotvec(rotation).as_matrix(), translation)
+        camera_from_world = rigid(rotation_matrix(path, rotation), translation)
         poses[f"k{number}"] = invert(camera_from_world)
     return relate_to_master(folder, "k1", poses)
+
+
+def rotation_matrix(where: Path | str, vector: np.ndarray) -> np.ndarray:
+    """Return the matrix (3, 3) of a rotation vector (3,), radians.
+
+    Raises UserError, beginning with ``where``, if it is longer than a whole turn.
+    """
+    length = float(np.linalg.norm(vector))
+    if length > 2 * np.pi:
+        raise UserError(
+            f"{where}: rotation vector R has length {length:.4g}, expected radians, at most a "
+            "whole turn (6.28); convert degrees to radians"
+        )
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def check_camera_name(path: Path, name: str) -> None:

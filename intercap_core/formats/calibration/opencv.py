@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import (
@@ -23,6 +22,7 @@ from intercap_core.formats.calibration.extrinsics import (
     check_distance,
     list_names,
     relate_to_master,
+    rotation_matrix,
 )
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.projection import radial_fraction
@@ -295,7 +295,7 @@ def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
     Raises UserError, beginning with ``where``, for numbers that are no pose.
     """
     r, t = parse_numbers(rotation, where, "R"), parse_numbers(translation, where, "T").ravel()
-    r = Rotation.from_rotvec(r.ravel()).as_matrix() if r.size == 3 else r
+    r = rotation_matrix(where, r.ravel()) if r.size == 3 else r
     if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
             f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"

@@ -69,6 +69,7 @@ def test_wrong_rig_files_are_refused(tmp_path: Path, content: str, words: str) -
         ({"R": [0, 0, float("nan")], "T": [0, 0, 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, float("inf"), 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, 1500, 0]}, "1500 m.*millimetres"),
+        ({"R": [0, 90, 0], "T": [0, 1, 0]}, "length 90, expected radians"),
     ],
 )
 def test_wrong_release_files_are_refused(tmp_path: Path, content: object, words: str) -> None:

@@ -198,6 +198,7 @@ def change(path: str, value: object):
         (change("cameras.right.T", ...), "camera 'right': has no pose"),
         (change("cameras.right.T", [2100.0, 0, 0]), "likely in millimetres"),
         (change("cameras.right.R", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "R is no rotation"),
+        (change("cameras.right.R", [0, -60, 0]), "'right': rotation vector R has length 60"),
         (change("cameras.right.depth", "yes"), "depth is 'yes', expected 'aligned'"),
         (change("cameras.right.depth.colour_from_depth", ...), "colour_from_depth is"),
         (change("cameras.right.depth.colour_from_depth", MILLIMETRES), "moves by 32 m"),
