@@ -36,7 +36,9 @@ from intercap_core.stage_list import STAGES
 
 DATASET = "dataset"
 MARKS = Path(".snakemake") / "out_of_date"
-_MARK_DELAY_NS = 1_000_000  # date of a mark after that of its output; less than any job takes
+# Date of a mark after that of its output, less than any job takes: the first that the file system
+# stores as a later date. Some store whole seconds, some even ones.
+_MARK_DELAYS_NS = (1_000_000, 1_000_000_000, 2_000_000_000)
 
 
 class OutputStatus(StrEnum):
@@ -171,8 +173,11 @@ class Plan:
                 # a unique content, in case Snakemake compares checksums of inputs
                 lines = [*self._state(name, stage).reasons, uuid.uuid4().hex]
                 path.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
-                date = max([file.stat().st_mtime_ns for file in dated], default=0) + _MARK_DELAY_NS
-                os.utime(path, ns=(date, date))
+                newest = max([file.stat().st_mtime_ns for file in dated], default=0)
+                for delay in _MARK_DELAYS_NS:
+                    os.utime(path, ns=(newest + delay, newest + delay))
+                    if path.stat().st_mtime_ns > newest:
+                        break
 
     def _dated_files(self, sequence: str, stage: str) -> list[Path]:
         """Existing files and folders whose date Snakemake may take for that of an output."""

@@ -368,6 +368,27 @@ def test_no_output_or_mark_is_dated_ahead_of_the_clock(folder: Path) -> None:
                 assert output.stat().st_mtime < mark.stat().st_mtime < time.time() + 0.001
 
 
+def test_marks_are_newer_where_dates_are_whole_seconds(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise Snakemake would not run the job of a stale output."""
+    project = load_project(SETTINGS)
+    set_date = os.utime
+
+    def in_seconds(path: Path, times: object = None, *, ns: tuple[int, int] = (0, 0)) -> None:
+        if ns[0]:
+            set_date(path, ns=(ns[0] // 10**9 * 10**9, ns[1] // 10**9 * 10**9))
+
+    for path in project.results.rglob("*.h5"):
+        in_seconds(path, ns=(path.stat().st_mtime_ns, path.stat().st_mtime_ns))
+    _set(folder, joint={"ground_weight": 2.0})
+    monkeypatch.setattr(os, "utime", in_seconds)
+    plan = Plan(load_project(SETTINGS))
+    plan.mark_all()
+    (mark,) = plan.mark(ONE, "joint")
+    assert mark.stat().st_mtime_ns == plan.output(ONE, "joint").stat().st_mtime_ns + 10**9
+
+
 @pytest.mark.parametrize("fault", ["cut", "missing", "whole output missing"])
 def test_a_release_refuses_damaged_and_incomplete_sequences(folder: Path, fault: str) -> None:
     project = load_project(SETTINGS)
