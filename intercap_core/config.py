@@ -17,6 +17,7 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     Field,
+    NonNegativeInt,
     field_validator,
 )
 
@@ -60,6 +61,13 @@ class DetectionsSettings(Model):
     the images without an entry in the keypoint files."""
     keypoint_device: Literal["cpu", "cuda"] = "cpu"
     """Device of the keypoint model."""
+    keypoint_layout: str | None = None
+    """Layout of the body points in keypoint files, by a name of docs/detectors.md; null = stated in
+    the files, or recognised by their number and by the lengths of the bones."""
+    keypoint_first_number: NonNegativeInt | None = None
+    """Number of the first image in names and ids of keypoint files; null = recognised."""
+    candidate_first_number: NonNegativeInt | None = None
+    """Number of the first image in names and ids of candidate files; null = recognised."""
     keypoint_full_confidence: Positive = 1.0
     """Keypoint confidence in files or model outputs that is mapped to 1. Raw responses of RTMW
     reach 5 and more."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,9 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import class_names
+from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.recordings.extract import advice_on_size
+from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.layouts import list_unread, open_layout
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
 from intercap_core.project import Project
@@ -25,7 +27,9 @@ from intercap_core.schemas import TRUTH
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
 FULL_LENGTH_SHARE = 0.95  # a shorter one is noted
 MIN_IMAGE_SHARE = 0.9  # smallest share of the expected images; recordings lose a few images
-_IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
+_IMAGE_IDS = [
+    re.compile(rb'"%s"\s*:\s*("[^"]*"|[^,}\s]+)' % key) for key in (b"image_id", b"file_name")
+]
 
 
 class CheckedRecording(NamedTuple):
@@ -55,8 +59,14 @@ class RecordingFindings:
     """Faults that cost a camera or most of its images."""
     notes: list[str] = field(default_factory=list)
     """Smaller losses and probable mistakes."""
-    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Width and height that the calibration states, by camera whose recording could be opened."""
+    images: dict[str, CameraImages] = field(default_factory=dict)
+    """Images of each camera whose recording could be opened; their number may be estimated."""
+    recognised: dict[str, set[str]] = field(default_factory=dict)
+    """What the content of keypoints and candidates tells about their form, by kind."""
+
+    def add_recognised(self, kind: str, texts: Iterable[str]) -> None:
+        """Add what was recognised in one camera's files."""
+        self.recognised.setdefault(kind, set()).update(texts)
 
 
 def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
@@ -103,8 +113,16 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
             f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
             f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
         )
-    findings.notes += _notes_on_keypoints(project, row, posed, findings.sizes)
-    findings.notes += _notes_on_candidates(project, row, posed, findings.sizes)
+    if len(posed) < 2:
+        findings.faults.append(
+            f"{row.recordings}: {len(posed)} camera {'is' if len(posed) == 1 else 'are'} used "
+            f"({', '.join(posed) or 'none'}), expected at least 2, since points are triangulated; "
+            "add recordings and camera poses, or correct frames.cameras"
+        )
+    findings.notes += _notes_on_keypoints(project, row, posed, findings)
+    findings.notes += _notes_on_candidates(project, row, posed, findings)
+    told = [f"{kind}: {', '.join(sorted(texts))}" for kind, texts in findings.recognised.items()]
+    findings.summary = "; ".join([findings.summary, *told]) if findings.summary else ""
     return findings
 
 
@@ -118,7 +136,7 @@ def faults_of_truth(path: Path) -> list[str]:
 
 
 def _notes_on_keypoints(
-    project: Project, row: SequenceEntry, cameras: list[str], sizes: dict[str, tuple[int, int]]
+    project: Project, row: SequenceEntry, cameras: list[str], findings: RecordingFindings
 ) -> list[str]:
     """Notes on cameras without keypoints, and on the first keypoints of the others."""
     settings = project.config.detections
@@ -132,13 +150,21 @@ def _notes_on_keypoints(
     folder, notes = row.keypoints, []
     if folder is None or not folder.is_dir():
         return []
-    full = settings.keypoint_full_confidence
     for name in cameras:
         if keypoint_files.has_keypoints(folder, name):
-            if name in sizes:
-                notes += keypoint_files.preview_keypoints(
-                    folder, name, size=sizes[name], full_confidence=full
+            if name in findings.images:
+                images = findings.images[name]
+                images = replace(images, first_number=settings.keypoint_first_number)
+                preview = keypoint_files.preview_keypoints(
+                    folder,
+                    images,
+                    full_confidence=settings.keypoint_full_confidence,
+                    layout=settings.keypoint_layout,
                 )
+                notes += preview.notes
+                findings.add_recognised("keypoints", preview.recognised)
+                whole, files = keypoint_files.keypoint_paths(folder, name)
+                notes += _compare_numbers(findings, "keypoints", folder, whole, files, images)
         elif settings.keypoint_model is None:
             notes.append(
                 f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
@@ -147,7 +173,7 @@ def _notes_on_keypoints(
 
 
 def _notes_on_candidates(
-    project: Project, row: SequenceEntry, cameras: list[str], sizes: dict[str, tuple[int, int]]
+    project: Project, row: SequenceEntry, cameras: list[str], findings: RecordingFindings
 ) -> list[str]:
     """Notes on cameras without candidates, and on format, size and labels of the first ones."""
     settings = project.config.detections
@@ -157,11 +183,17 @@ def _notes_on_candidates(
     labels: set[str] = set()
     for name in cameras:
         if candidate_files.has_candidates(folder, name, row.layout):
-            if name in sizes:
+            if name in findings.images:
+                images = findings.images[name]
+                images = replace(images, first_number=settings.candidate_first_number)
                 preview = candidate_files.preview_candidates(
-                    folder, name, size=sizes[name], names=class_names(settings.category_names)
+                    folder, images, names=class_names(settings.category_names)
                 )
                 notes += preview.notes
+                findings.add_recognised("candidates", preview.recognised)
+                whole = candidate_files.camera_file(folder, name)
+                files = candidate_files.image_files(folder, name)
+                notes += _compare_numbers(findings, "candidates", folder, whole, files, images)
                 labels |= preview.labels
         elif settings.segmentation_model is None:
             notes.append(f"{folder} has no {name}.json; add this camera's candidates")
@@ -192,6 +224,7 @@ def check_recordings(
         without_depth: the settings do not use depth.
     """
     findings, recordings = RecordingFindings(), {}
+    stems: dict[str, tuple[str, ...]] = {}
     for name in cameras:
         try:
             with layout.open(name) as recording:
@@ -208,6 +241,8 @@ def check_recordings(
                     f"{recording.source}: camera {name}: {note}"
                     for note in (*recording.notes, *recordings[name].preview.remarks)
                 ]
+                if isinstance(recording, FilesRecording) and row.layout == "plain":
+                    stems[name] = tuple(path.stem for _, path in recording.colour_files)
         except UserError as error:
             findings.faults.append(str(error))
         except OSError as error:
@@ -218,9 +253,8 @@ def check_recordings(
     expected = _expected_seconds(recordings)
     for name, recording in recordings.items():
         _check_recording(findings, row, name, recording, expected.get(name))
-        findings.notes += _check_detections(row, name, recording.preview.images)
+        findings.images[name] = _images_of(name, recording, stems.get(name, ()))
     findings.summary = _summary(row, recordings)
-    findings.sizes = {name: recording.size for name, recording in recordings.items()}
     return findings
 
 
@@ -295,45 +329,55 @@ def _check_recording(
             )
 
 
-def _check_detections(row: SequenceEntry, name: str, images: int | None) -> list[str]:
-    """Notes on keypoints or candidates whose number of images differs from the recording's."""
-    counted = {
-        "keypoints": row.keypoints and _count(*keypoint_files.keypoint_paths(row.keypoints, name)),
-        "candidates": row.candidates and _count(
-            candidate_files.camera_file(row.candidates, name),
-            candidate_files.image_files(row.candidates, name),
-        ),
-    }  # fmt: skip
-    notes = []
-    for kind, count in counted.items():
-        if not images or not count:
-            continue
-        folder = getattr(row, kind)
-        if count < MIN_IMAGE_SHARE * images:
-            notes.append(
-                f"{folder}: {kind} of camera {name} cover {count} of its {images} images; run "
-                "the detector on all of them"
-            )
-        elif count * MIN_IMAGE_SHARE > images:
-            notes.append(
-                f"{folder}: {kind} of camera {name} cover {count} images, it has {images}; "
-                "they may belong to another recording, or the recording is cut off"
-            )
-    return notes
+def _images_of(name: str, recording: CheckedRecording, stems: tuple[str, ...]) -> CameraImages:
+    """The images of a recording, numbered from 0; ``stems`` are names of image files."""
+    number = np.arange(len(stems) or recording.preview.images or 0)
+    times = np.round(1e6 * number / recording.fps).astype(np.int64)
+    return CameraImages(name, recording.size, number, times, frozenset(number.tolist()), stems)
 
 
-def _count(file: Path | None, image_files: list[Path]) -> int | None:
-    """Number of images that a camera's detections cover; None if unknown.
+def _compare_numbers(
+    findings: RecordingFindings,
+    kind: str,
+    folder: Path,
+    whole: Path | None,
+    files: list[Path],
+    images: CameraImages,
+) -> list[str]:
+    """Notes on detections of one camera that are of more or fewer images than its recording's.
+
+    Adds the numbering of a file of all images to the findings.
 
     Args:
-        file: the file of all images, if there is one.
-        image_files: files of single images.
+        findings: receives the numbering.
+        kind: keypoints or candidates.
+        folder: folder of all cameras' detections.
+        whole: the file of all images, if there is one.
+        files: files of single images.
+        images: the camera's images.
     """
-    if file is None:
-        return len(image_files) or None
-    if file.stat().st_size > 64 << 20:  # would take more than 0.5 s
-        return None
-    return len(set(_IMAGE_ID.findall(file.read_bytes()))) or None
+    recorded, count = len(images.recorded), len(files)
+    if whole is not None:
+        if whole.stat().st_size > 64 << 20:  # would take more than 0.5 s
+            return []
+        content = whole.read_bytes()
+        ids, names = ({v.strip(b'"') for v in form.findall(content)} for form in _IMAGE_IDS)
+        count = len(ids or names)
+        _, remark = images.match_numbers({int(v) for v in ids if v.isdigit()})
+        findings.add_recognised(kind, [f"images {remark}"] if remark else [])
+    if not recorded or not count:
+        return []
+    if count < MIN_IMAGE_SHARE * recorded:
+        return [
+            f"{folder}: {kind} of camera {images.name} cover {count} of its {recorded} images; run "
+            "the detector on all of them"
+        ]
+    if count * MIN_IMAGE_SHARE > recorded:
+        return [
+            f"{folder}: {kind} of camera {images.name} cover {count} images, it has {recorded}; "
+            "they may belong to another recording, or the recording is cut off"
+        ]
+    return []
 
 
 def _summary(row: SequenceEntry, recordings: dict[str, CheckedRecording]) -> str:

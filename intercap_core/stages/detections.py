@@ -6,7 +6,7 @@ import hashlib
 import logging
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -158,16 +158,27 @@ def _read_camera(
     times = {t: int(images.time_us[t]) for t in images.sets}
     full = settings.keypoint_full_confidence
     if sequence.keypoints is not None:
-        people = keypoint_files.read_camera(sequence.keypoints, images, full_confidence=full)
+        people = keypoint_files.read_camera(
+            sequence.keypoints,
+            replace(images, first_number=settings.keypoint_first_number),
+            full_confidence=full,
+            layout=settings.keypoint_layout,
+        )
         _add_people(result, people, images)
     elif behave is not None:
         paths = {int(images.number[t]): behave.keypoints(time, name) for t, time in times.items()}
-        people = keypoint_files.read_files(sequence.recordings, paths, images, full_confidence=full)
+        people = keypoint_files.read_files(
+            sequence.recordings,
+            paths,
+            images,
+            full_confidence=full,
+            layout=settings.keypoint_layout,
+        )
         _add_people(result, people, images)
     if sequence.candidates is not None:
         candidates = candidate_files.read_camera(
             sequence.candidates,
-            images,
+            replace(images, first_number=settings.candidate_first_number),
             layout=sequence.layout,
             min_score=settings.min_score,
             names=class_names(settings.category_names),

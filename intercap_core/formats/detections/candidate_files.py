@@ -58,6 +58,8 @@ class CandidatePreview:
     """Messages for the user about faults."""
     labels: set[str] = field(default_factory=set)
     """Labels of the instances."""
+    recognised: list[str] = field(default_factory=list)
+    """What was recognised by the content."""
 
 
 def camera_file(folder: Path, camera: str) -> Path | None:
@@ -123,13 +125,14 @@ def _add_file(
     candidates: CandidatesByImage, content: CandidateFile, images: CameraImages, path: Path
 ) -> None:
     """Sort one file's results by image."""
-    by_image, absent = sort_by_image(content, images)
+    by_image, absent, remark = sort_by_image(content, images)
     for place, instances in by_image.items():
         candidates.by_image.setdefault(place, []).extend(instances)
     name = short_name(path)
     note_faults(candidates.notes, f"of {content.entries} results in {name}", content.faults)
-    if content.scaled:
-        candidates.notes.append(f"{content.scaled} masks in {name} scaled to the image's size")
+    candidates.notes += _notes_on_scale(content.scaled, content.shares, f" in {name}")
+    if remark:
+        candidates.notes.append(f"images of {name} are {remark}")
     note_absent(candidates.notes, absent, images, name)
 
 
@@ -138,10 +141,10 @@ def _add_image_files(
 ) -> None:
     """Read files that hold one image each, named after it."""
     by_name = {path.name: path for path in paths}
-    numbers = images.match_names(by_name)
+    numbers, remark = images.recognise_names(by_name)
     absent, broken = [], []
     faults: list[str] = []
-    scaled = entries = 0
+    scaled = shares = entries = 0
     for name, path in by_name.items():
         place = numbers.get(name)
         if place is None or place not in images.recorded:
@@ -158,14 +161,28 @@ def _add_image_files(
             candidates.by_image.setdefault(place, []).extend(instances)
         faults += [f"{printable(name)}, {fault}" for fault in content.faults]
         entries, scaled = entries + content.entries, scaled + content.scaled
+        shares += content.shares
     note_broken(candidates.notes, "candidates", broken)
     note_faults(candidates.notes, f"of {entries} results", faults)
-    if scaled:
-        candidates.notes.append(f"{scaled} masks scaled to the image's size")
+    candidates.notes += _notes_on_scale(scaled, shares)
+    if remark:
+        candidates.notes.append(f"files of candidates are {remark}")
     without = len(images.recorded) - len(by_name) + len(absent)
     if by_name and without > 0:
         candidates.notes.append(f"no file of candidates for {without} images")
     note_unmatched(candidates.notes, "files of candidates", absent)
+
+
+def _notes_on_scale(scaled: int, shares: int, where: str = "") -> list[str]:
+    """Notes on the numbers of masks that were scaled from another resolution or from shares."""
+    notes = []
+    if scaled:
+        notes.append(f"{scaled} masks{where} scaled to the image's size")
+    if shares:
+        notes.append(
+            f"{shares} masks{where} are given as shares of the image's size and scaled to pixels"
+        )
+    return notes
 
 
 def _add_masks_of_camera(
@@ -182,7 +199,9 @@ def _add_masks_of_camera(
         by_name = find_instance_masks(below) if below.is_dir() else {}
         if not by_name:
             return
-        numbers = images.match_names(by_name)
+        numbers, remark = images.recognise_names(by_name)
+        if remark:
+            candidates.notes.append(f"names of masks are {remark}")
         absent = [name for name in by_name if numbers.get(name) not in images.recorded]
         note_unmatched(candidates.notes, "names of masks", absent)
         files = {numbers[name]: masks for name, masks in by_name.items() if name in numbers}
@@ -210,7 +229,7 @@ def add_masks(
 
 
 def preview_candidates(
-    folder: Path, camera: str, *, size: tuple[int, int], names: Mapping[int, str]
+    folder: Path, images: CameraImages, *, names: Mapping[int, str]
 ) -> CandidatePreview:
     """Read the beginning of one camera's file, or the first of its files of one image.
 
@@ -218,13 +237,16 @@ def preview_candidates(
 
     Args:
         folder: folder of candidates of the sequence.
-        camera: name of the camera.
-        size: width and height of its colour images.
+        images: the camera's images.
         names: classes by number.
     """
     preview = CandidatePreview()
-    whole = camera_file(folder, camera)
-    path = whole if whole is not None else next(iter(image_files(folder, camera)), None)
+    size = images.size
+    whole = camera_file(folder, images.name)
+    files = image_files(folder, images.name)
+    _, remark = images.recognise_names(path.name for path in files)
+    preview.recognised += [f"files {remark}"] if remark else []
+    path = whole if whole is not None else next(iter(files), None)
     if path is None:
         return preview
     try:
@@ -246,5 +268,7 @@ def preview_candidates(
             f"{path}: masks are of another resolution than the images of {size[0]}x{size[1]} and "
             "will be scaled"
         )
+    if parsed.shares:
+        preview.recognised.append("corners are shares of the image's size")
     preview.labels = {instance.label for _, instance in parsed.results}
     return preview

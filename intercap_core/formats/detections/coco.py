@@ -14,13 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from intercap_core.formats.detections.class_names import check_label, parse_class_names
-from intercap_core.formats.detections.instance import Instance, to_rle
-from intercap_core.geometry.camera import masks
+from intercap_core.formats.detections.instance import Instance, make_instance, to_rle
 from intercap_core.inputs.documents import json_decoder, parse_json
 from intercap_core.inputs.files import UnreadableFile, quoted, read_bytes
 
@@ -40,7 +39,10 @@ class ImageKey(NamedTuple):
     """How a file refers to an image: by number, by name, or by both."""
 
     number: int | None
+    """Position or id of the image."""
     name: str | None
+    size: tuple[int, int] | None = None
+    """Width and height that the file states for the image."""
 
 
 @dataclass
@@ -58,7 +60,9 @@ class DetectionFile(Generic[Result]):
     entries: int = 0
     """Number of entries, without those whose score is too low."""
     scaled: int = 0
-    """Number of masks of another resolution than the images."""
+    """Number of results of another resolution than the images."""
+    shares: int = 0
+    """Number of masks whose corners are shares of the image's width and height."""
 
     @property
     def is_useless(self) -> bool:
@@ -93,10 +97,8 @@ class _FileHead:
 
     names: Mapping[int, str]
     """Classes by number."""
-    files: Mapping[int, str]
-    """Names of images by id."""
-    sizes: Mapping[int, tuple[int, int]]
-    """Sizes of images by id."""
+    listed: Mapping[int | str, ImageKey]
+    """Images by id and by name."""
     size: tuple[int, int] | None
     """Size of all images."""
     corners: bool
@@ -118,7 +120,7 @@ def parse_candidates(
     """
     entries = content
     images: list[ImageKey] | None = None
-    head = _FileHead(form.names, {}, {}, None, False)
+    head = _FileHead(form.names, {}, None, False)
     if isinstance(content, dict):
         entries = content.get("annotations")
         head, images = _read_file_head(content, form.names)
@@ -132,16 +134,17 @@ def parse_candidates(
         try:
             if not isinstance(entry, dict):
                 raise ValueError(f"expected a result, found {quoted(entry)}")
-            image = image_of(entry, head.files, one_image)
+            image = image_of(entry, head.listed, one_image)
             score = _score(entry)
             if score < form.min_score:
                 continue
-            instance, scaled = _instance(entry, score, image, head, form.size)
+            instance, factors = _instance(entry, score, image, head, form.size)
         except ValueError as error:
             result.add_fault(f"entry {index}", image, error)
         else:
             result.results.append((image, instance))
-            result.scaled += scaled
+            result.scaled += factors not in ((1.0, 1.0), form.size)
+            result.shares += factors == form.size
         result.entries += 1
     return result
 
@@ -203,14 +206,7 @@ def _read_file_head(
     size = _size(content.get("img_width"), content.get("img_height"))
     corners = content.get("box_format") == "xyxy"
     listed = read_listed_images(content)
-    if listed is None:
-        return _FileHead({**names, **own}, {}, {}, size, corners), None
-    sizes = {
-        value["id"]: own_size
-        for value in content["images"]
-        if (own_size := _size(value.get("width"), value.get("height"))) is not None
-    }
-    return _FileHead({**names, **own}, names_by_id(listed), sizes, size, corners), listed
+    return _FileHead({**names, **own}, listed_images(listed), size, corners), listed
 
 
 def read_listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
@@ -228,13 +224,14 @@ def read_listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
         if type(number) is not int or not 0 <= number <= _LARGEST_ID:
             raise UnreadableDetections(f"'images' must list objects with id, found {quoted(value)}")
         name = value.get("file_name")
-        images.append(ImageKey(number, name if isinstance(name, str) else None))
+        size = _size(value.get("width"), value.get("height"))
+        images.append(ImageKey(number, name if isinstance(name, str) else None, size))
     return images
 
 
-def names_by_id(images: list[ImageKey]) -> dict[int, str]:
-    """Names of images by id, for those that have one."""
-    return {i.number: i.name for i in images if i.number is not None and i.name is not None}
+def listed_images(images: list[ImageKey] | None) -> dict[int | str, ImageKey]:
+    """Images that a file lists, by id and by name."""
+    return {key: image for image in images or () for key in image[:2] if key is not None}
 
 
 def _size(width: Any, height: Any) -> tuple[int, int] | None:
@@ -243,14 +240,16 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
     return None
 
 
-def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -> ImageKey:
+def image_of(
+    entry: dict[str, Any], listed: Mapping[int | str, ImageKey], one_image: bool
+) -> ImageKey:
     """The image of an entry.
 
     Raises ValueError if the entry must state its image and does not.
 
     Args:
         entry: the entry.
-        files: names of images by id.
+        listed: images by id and by name.
         one_image: the entry need not state its image.
     """
     value, name = entry.get("image_id"), entry.get("file_name", entry.get("image_path"))
@@ -259,28 +258,29 @@ def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -
     if not isinstance(name, str):
         name = None
     if value is None and (one_image or name is not None):
-        return ImageKey(None, name)
+        return ImageKey(None, name, listed[name].size if name in listed else None)
     if type(value) is not int or not 0 <= value <= _LARGEST_ID:
         raise ValueError(
             "image_id must be the whole number of a colour image from 0, or its file's name, "
             f"found {quoted(value)}"
         )
-    return ImageKey(value, files.get(value) if name is None else name)
+    known = listed.get(value, ImageKey(value, None))
+    return known if name is None else known._replace(name=name)
 
 
 def _instance(
     entry: dict[str, Any], score: float, image: ImageKey, head: _FileHead, size: tuple[int, int]
-) -> tuple[Instance, bool]:
-    """The instance of an entry, and whether its mask was scaled."""
+) -> tuple[Instance, tuple[float, float]]:
+    """The instance of an entry, and the factors by which its mask was scaled."""
     label = _label(entry, head.names)
-    own_size = head.sizes.get(-1 if image.number is None else image.number, head.size)
     segmentation = entry.get("segmentation", entry.get("segments"))
-    rle, (x_scale, y_scale) = to_rle(segmentation, size, own_size)
-    scaled = (x_scale, y_scale) != (1.0, 1.0)
+    rle, factors = to_rle(segmentation, size, image.size or head.size)
+    instance = make_instance(label, score, rle, size)
+    if instance is None:
+        raise ValueError("its mask is empty")
     box = entry.get("bbox", entry.get("box"))
-    if box is None or scaled:
-        box = masks.Runs(rle, size[1], size[0]).box
-        return Instance(label, score, (*map(float, box),), rle), scaled  # type: ignore[arg-type]
+    if box is None or factors != (1.0, 1.0):
+        return instance, factors
     corners = head.corners
     if isinstance(box, dict):
         box, corners = [box.get(key) for key in ("x1", "y1", "x2", "y2")], True
@@ -298,8 +298,7 @@ def _instance(
         raise ValueError(
             f"bbox is {quoted(box)}, expected pixels of the image of {size[0]}x{size[1]}"
         )
-    masks.Runs(rle, size[1], size[0])  # raises ValueError if the string is no mask of the image
-    return Instance(label, score, (x, y, w, h), rle), scaled
+    return (replace(instance, box=(x, y, w, h)) if w and h else instance), factors
 
 
 def _score(entry: dict[str, Any]) -> float:

@@ -6,12 +6,15 @@ files refer to an image depends on the layout of the recording:
 - ``k4a``, ``behave``, videos: its position among the camera's copied images, from 0;
 - ``plain``: its position among the camera's image files, damaged ones included;
 - ``intercap``: the number in the image file's name.
+
+Tools also number images from 1, from the first frame of a clip, or by time, and add other numbers
+to a name. :meth:`CameraImages.match_numbers` compares the numbers with those of the images.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -28,7 +31,12 @@ from intercap_core.inputs.files import printable
 
 FILES_NAMED = 3  # broken files or entries that a note names; the others are only counted
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
-_LAST_NUMBER = re.compile(r"(?:.*\D)?0*(\d{1,9})")
+_NUMBERS = re.compile(r"\d{1,25}")
+_DECIMALS = re.compile(r"\d{1,15}(?:\.\d{1,9})?")
+# Least share of the images that have a number, for numbers that count from another number than 0.
+MIN_SHARE_SHIFTED = 0.5
+# Largest deviation of times from the images' times, in steps between two images.
+MAX_TIME_ERROR = 0.25
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,8 @@ class CameraImages:
     stems: tuple[str, ...] = ()
     """Names of the image files without suffix, in the order of their numbers; () if files cannot
     be named after images."""
+    first_number: int | None = None
+    """Number of the first image in the detections' names and ids; None = recognised."""
 
     @property
     def sets(self) -> list[int]:
@@ -58,18 +68,82 @@ class CameraImages:
     def match_names(self, names: Iterable[str]) -> dict[str, int]:
         """Numbers of the images that names of files refer to; other names are left out.
 
-        If any name is that of an image file, only names of image files are matched. Otherwise the
-        number at the end of a name counts (``frame_0012.jpg`` is image 12). If two names end in the
-        same number, the result is empty.
+        If any name is that of an image file, only names of image files are matched. Otherwise a
+        number in the names counts (``frame_0012_k1.jpg`` is image 12): the last one that differs
+        in all names and that :meth:`match_numbers` recognises, otherwise the last one. If two names
+        end in the same number and no other number differs, the result is empty.
         """
+        return self.recognise_names(names)[0]
+
+    def recognise_names(self, names: Iterable[str]) -> tuple[dict[str, int], str]:
+        """As :meth:`match_names`, with a remark on how the names are numbered, "" = from 0."""
         stems = {name: strip_suffix(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
         named = {name: places[stem] for name, stem in stems.items() if stem in places}
-        if named:
-            return named
-        matches = {name: _LAST_NUMBER.fullmatch(stem) for name, stem in stems.items()}
-        numbers = {name: int(match.group(1)) for name, match in matches.items() if match}
-        return numbers if len(set(numbers.values())) == len(numbers) else {}
+        if named and self.first_number is None:
+            return named, ""
+        fields = _number_fields(stems)
+        matches = [(field, *self.match_numbers(field.values())) for field in fields]
+        # Numbers from 0 need no hypothesis, so they come first.
+        for field, numbers, remark in sorted(matches, key=lambda match: bool(match[2])):
+            if numbers is not None:
+                return {name: numbers[value] for name, value in field.items()}, remark
+        last = {name: int(value) for name, value in fields[0].items()} if fields else {}
+        return last, self.remark_on_start(last.values())
+
+    def match_numbers(self, numbers: Collection[float]) -> tuple[dict[float, int] | None, str]:
+        """Image number of each number of the detections, and a remark on how they count.
+
+        None in place of the image numbers if the numbers fit no image or some of them do not.
+        Hypotheses in order: the stated first number; image numbers from 0; from 1, if one of them
+        is beyond the last image; from any number, or times, if there is one for each image.
+        """
+        first, given = min(self.recorded, default=0), sorted(set(numbers))
+        if not given or not self.recorded:
+            return None, ""
+        if self.first_number is not None:
+            return {n: int(n) - self.first_number + first for n in given}, ""
+        if self.recorded.issuperset(given):
+            return {n: int(n) for n in given}, self.remark_on_start(given)
+        share = len(given) / len(self.recorded)
+        if share >= MIN_SHARE_SHIFTED and self.recorded.issuperset(n - 1 for n in given):
+            return {n: int(n) - 1 for n in given}, "numbered from 1"
+        images = sorted(self.recorded)
+        if len(given) == len(images):
+            shift = given[0] - images[0]
+            if all(n - shift == image for n, image in zip(given, images, strict=True)):
+                return {n: int(n - shift) for n in given}, f"numbered from {given[0]:.0f}"
+            if self._are_times(np.array(given), np.array(images)):
+                return dict(zip(given, images, strict=True)), "named by time"
+        return None, ""
+
+    def _are_times(self, given: np.ndarray, images: np.ndarray) -> bool:
+        """Whether numbers (N,) are the times of the images (N,) in any unit, from any start."""
+        in_sets = self.number >= 0
+        known = dict(
+            zip(self.number[in_sets].tolist(), self.time_us[in_sets].tolist(), strict=True)
+        )
+        times = np.array([known.get(int(image), -1) for image in images], float)
+        for clock in (images.astype(float), times):
+            if len(given) < 3 or not (clock >= 0).all() or not (np.diff(clock) > 0).all():
+                continue
+            unit, start = np.polynomial.polynomial.polyfit(clock, given, 1)[::-1]
+            error = np.abs(given - start - unit * clock).max()
+            if unit > 0 and error <= MAX_TIME_ERROR * unit * np.median(np.diff(clock)):
+                return True
+        return False
+
+    def remark_on_start(self, numbers: Iterable[float]) -> str:
+        """Warning if all images from 1 on have a number and image 0 has none, "" otherwise."""
+        given = set(numbers)
+        if not given or min(given) != min(self.recorded, default=0) + 1:
+            return ""
+        if len(given) < max(0.9 * (max(given) - min(given) + 1), 2):
+            return ""
+        return (
+            f"read as numbered from {min(self.recorded)}, but begin at {min(given):.0f}: "
+            "set detections.keypoint_first_number or candidate_first_number if they count from it"
+        )
 
 
 def strip_suffix(name: str) -> str:
@@ -77,13 +151,30 @@ def strip_suffix(name: str) -> str:
     return _SUFFIX.sub("", PurePosixPath(name.replace("\\", "/")).name)
 
 
+def _number_fields(stems: Mapping[str, str]) -> list[dict[str, float]]:
+    """Numbers that may identify the images, the last one of each name first.
+
+    A field is a number at the same place, counted from the end, in all names, and differs in all of
+    them. Decimal numbers, such as times in seconds, are the last fields.
+    """
+    fields = []
+    for form in (_NUMBERS, _DECIMALS):
+        found = {name: form.findall(stem)[::-1] for name, stem in stems.items()}
+        found = {name: numbers for name, numbers in found.items() if numbers}
+        for at in range(min(map(len, found.values()), default=0)):
+            field = {name: float(numbers[at]) for name, numbers in found.items()}
+            if len(set(field.values())) == len(field) and field not in fields:
+                fields.append(field)
+    return fields
+
+
 def find_repeated_number(names: Iterable[str]) -> list[str]:
     """Names that end in the same number; [] if there are no two such names."""
     by_number: dict[int, list[str]] = {}
     for name in names:
-        match = _LAST_NUMBER.fullmatch(strip_suffix(name))
-        if match:
-            by_number.setdefault(int(match.group(1)), []).append(name)
+        numbers = _NUMBERS.findall(strip_suffix(name))
+        if numbers:
+            by_number.setdefault(int(numbers[-1]), []).append(name)
     return next((group for group in by_number.values() if len(group) > 1), [])
 
 
@@ -151,27 +242,31 @@ def find_json_files(folder: Path) -> list[Path]:
 
 def sort_by_image(
     file: DetectionFile[Result], images: CameraImages
-) -> tuple[dict[int, list[Result]], list[str]]:
+) -> tuple[dict[int, list[Result]], list[str], str]:
     """Sort a file's results by image number.
 
-    Returns the results by number, and the names of images that were not recorded. An empty list
-    means that the detector processed the image and found nothing. Images without a list are
-    unknown:
+    Returns the results by number, the names of images that were not recorded, and a remark on how
+    the images are numbered, "" = from 0. An empty list means that the detector processed the image
+    and found nothing. Images without a list are unknown:
 
     - images with a faulty entry and no other result;
     - images that are missing in the file's list of images;
     - all images, if the file has no such list and none of its entries can be used.
     """
     keys = [*(key for key, _ in file.results), *file.faulty, *(file.images or ())]
-    by_name = images.match_names(key.name for key in keys if key.name is not None)
+    by_name, remark = images.recognise_names(key.name for key in keys if key.name is not None)
     ids = {key.number for key in keys if key.number is not None}
-    if len(images.recorded & ids) > len(images.recorded.intersection(by_name.values())):
-        by_name = {}  # the numbers in the names are something else, such as times
+    by_id, remark_on_ids = images.match_numbers(ids)
+    by_id = by_id or {}
+    known_ids = images.recorded.intersection(by_id.get(n, n) for n in ids)
+    if len(known_ids) > len(images.recorded.intersection(by_name.values())):
+        by_name = {}  # the numbers in the names are something else
+    remark = remark if by_name else remark_on_ids or images.remark_on_start(ids)
 
     def number(key: ImageKey) -> int | None:
         if key.name is not None and (by_name or key.number is None):
             return by_name.get(key.name)
-        return key.number
+        return None if key.number is None else by_id.get(key.number, key.number)
 
     if file.images is not None:
         known = {n for n in map(number, file.images) if n is not None}
@@ -186,7 +281,7 @@ def sort_by_image(
             by_image.setdefault(place, []).append(result)
         else:
             absent.append(key.name if key.name is not None else str(key.number))
-    return by_image, absent
+    return by_image, absent, remark
 
 
 def note_absent(notes: list[str], names: list[str], images: CameraImages, where: str) -> None:

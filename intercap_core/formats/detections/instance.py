@@ -17,6 +17,8 @@ from intercap_core.inputs.files import quoted
 
 MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
 MASK_THRESHOLD = 128  # grey level of 8 bits; JPEG blurs the two values of a mask
+# Coordinates from 0 to 1, somewhat more outside the image, are shares of its width and height.
+MAX_SHARE = 2.0
 PERSON_LABEL = "person"  # name of the class of people in COCO and all lists that follow it
 
 
@@ -50,7 +52,7 @@ def make_instance(label: str, score: float, rle: bytes, size: tuple[int, int]) -
 def scale_to(own: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
     """Factors (x, y) from a mask of size ``own`` (width, height) to an image of ``size``.
 
-    Raises ValueError if the mask is no reduced copy of the image.
+    Raises ValueError if the mask is no copy of the image at another resolution.
     """
     if own == size:
         return 1.0, 1.0
@@ -62,6 +64,14 @@ def scale_to(own: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]
             "the images as recorded"
         )
     return x, y
+
+
+def are_shares(coordinates: np.ndarray) -> bool:
+    """Whether coordinates (N,) of one shape are shares of the image's width and height.
+
+    No person and no object that is used lies within the first two pixels of an image.
+    """
+    return coordinates.size > 0 and bool((np.abs(coordinates) <= MAX_SHARE).all())
 
 
 def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -81,17 +91,19 @@ def to_rle(
         segmentation: an RLE with size and counts (compressed, also as the text of Python's bytes;
             or a list of lengths), polygons, one flat polygon, or lists ``x`` and ``y`` of corners.
         size: width and height of the result.
-        stated: size of the image according to the file, for forms that do not state their own.
+        stated: size of the image according to the file.
     """
+    factors = scale_to(stated, size) if stated is not None else (1.0, 1.0)
     if isinstance(segmentation, dict) and "counts" in segmentation:
         return _from_rle(segmentation, size)
-    polygons = _polygons(segmentation)
-    if polygons is None:
+    given = _polygons(segmentation)
+    if given is None:
         raise ValueError("has no segmentation; expected an RLE with size and counts, or polygons")
-    x, y = scale_to(stated, size) if stated is not None else (1.0, 1.0)
-    scaled = [
-        [v * (y if i % 2 else x) for i, v in enumerate(_numbers(polygon))] for polygon in polygons
-    ]
+    polygons = [_numbers(polygon) for polygon in given]
+    x, y = factors
+    if are_shares(np.array([v for polygon in polygons for v in polygon])):
+        x, y = size
+    scaled = [[v * (y if i % 2 else x) for i, v in enumerate(polygon)] for polygon in polygons]
     return masks.from_polygons(scaled, size[1], size[0]), (x, y)
 
 

@@ -7,9 +7,10 @@ files that cannot be used are noted.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +27,23 @@ from intercap_core.formats.detections.image_numbers import (
     short_name,
     sort_by_image,
 )
-from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers
+from intercap_core.formats.detections.instance import MAX_SHARE, are_shares, scale_to
+from intercap_core.formats.detections.keypoints import (
+    KeypointReader,
+    PeopleFile,
+    compare_bones,
+    layouts,
+    read_people,
+    readers,
+    visible,
+)
 
-# If all coordinates of a person are smaller, they are not pixels but shares of the image's size: 0
-# to 1, somewhat more outside the image.
-MAX_NORMALISED_PX = 2.0
+# Shares of compare_bones over random poses and views of the open body: 0.37 in body_25, 0.64 in
+# coco; read in another layout of the same number of points 0.84 to 1.9, points in random order 1.3.
+CERTAIN_BONE_SHARE = 0.75  # below it the layout is certain
+MAX_BONE_SHARE = 1.0  # above it points are not joined by bones
+MAX_SHARE_OF_OTHER = 0.75  # another layout is used if its share is smaller by this factor
+FILES_PREVIEWED = 20
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
 
 
@@ -60,7 +73,7 @@ class KeypointCleaner:
         """
         x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
         with np.errstate(invalid="ignore"):
-            seen = np.isfinite(people).all(-1) & (confidence > 0) & ((x != 0) | (y != 0))
+            seen = visible(np.asarray(people, np.float64))
             # The centres of pixels have integer coordinates.
             inside = (np.minimum(x, y) >= -0.5) & (x < self.size[0] - 0.5)
             inside &= y < self.size[1] - 0.5
@@ -73,7 +86,7 @@ class KeypointCleaner:
         result = np.where(known[..., None], np.stack([x, y, share], -1), 0).astype(np.float32)
         present = known.any(-1)
         largest = result[..., :2].max((1, 2), initial=0)
-        normalised = present & (largest <= MAX_NORMALISED_PX)
+        normalised = present & (largest <= MAX_SHARE)
         self.normalised += int(normalised.sum())
         return result[present & ~normalised]
 
@@ -91,7 +104,7 @@ class KeypointCleaner:
         if self.normalised:
             notes.append(
                 f"{self.normalised} people left out whose points all lie within "
-                f"{MAX_NORMALISED_PX:g} pixels of the upper left corner: coordinates must be "
+                f"{MAX_SHARE:g} pixels of the upper left corner: coordinates must be "
                 "pixels, not shares of the image"
             )
         if self.beyond:
@@ -110,14 +123,23 @@ class PeopleByImage:
     """People (P, 135, 3) by image number; P = 0 if the detector found none in the image."""
     notes: list[str] = field(default_factory=list)
     """Messages for the user about people and files that were left out."""
+    recognised: list[str] = field(default_factory=list)
+    """What was recognised by the content: layout, numbering, unit."""
 
 
 @dataclass
 class _Reading:
     """State while one camera's files are read."""
 
-    cleaner: KeypointCleaner
-    people: PeopleByImage = field(default_factory=PeopleByImage)
+    images: CameraImages
+    layout: str | None
+    """Layout according to the settings."""
+    raw: dict[int, np.ndarray] = field(default_factory=dict)
+    """People (P, 135, 3) by image number, as written."""
+    assumed: set[str] = field(default_factory=set)
+    """Layouts that were selected by the number of points alone."""
+    notes: list[str] = field(default_factory=list)
+    recognised: list[str] = field(default_factory=list)
     broken: list[str] = field(default_factory=list)
     """Files that cannot be loaded."""
     faults: list[str] = field(default_factory=list)
@@ -125,17 +147,110 @@ class _Reading:
     used: bool = False
     """Whether anything could be used."""
 
-    def finish(self, folder: Path, camera: str) -> PeopleByImage:
+    def parse(
+        self, loaded: Any, reader: KeypointReader, path: Path, *, one_image: bool
+    ) -> PeopleFile | None:
+        """The people of a loaded file in pixels of the images; None with a fault if none."""
+        try:
+            content = read_people(loaded, reader.load, one_image=one_image, layout=self.layout)
+        except UnreadableDetections as error:
+            self.faults.append(f"{short_name(path)} {error}")
+            return None
+        self.assumed |= content.assumed
+        results, content.results = content.results, []
+        for key, person in results:
+            try:
+                x, y = scale_to(key.size, self.images.size) if key.size else (1.0, 1.0)
+            except ValueError as error:
+                content.add_fault("a person", key, error)
+                continue
+            if (x, y) != (1.0, 1.0):  # pixel centres have integer coordinates
+                scaled = (person[:, :2] + 0.5) * (x, y) - 0.5
+                seen = (person[:, :2] != 0).any(1, keepdims=True)
+                person = np.column_stack([np.where(seen, scaled, 0), person[:, 2]])
+                content.scaled += 1
+            content.results.append((key, person))
+        if content.scaled:
+            self.recognised.append(f"scaled from {content.results[0][0].size} pixels")
+        return content
+
+    @property
+    def people(self) -> np.ndarray:
+        """All people (N, 135, 3), as written."""
+        return np.concatenate([NOBODY, *self.raw.values()])
+
+    def finish(self, folder: Path, camera: str, full_confidence: float) -> PeopleByImage:
         """The people, with notes; raises UserError if files can be loaded and none can be used."""
-        notes = self.people.notes
+        notes = self.notes
         note_broken(notes, "keypoint files", self.broken)
         if self.faults and not self.used:
             raise UserError(
                 f"{folder}: none of camera {camera}'s keypoints can be used: {self.faults[0]}"
             )
         note_faults(notes, "people or files of keypoints", self.faults)
-        notes += self.cleaner.notes()
-        return self.people
+        self._scale_shares()
+        cleaner = KeypointCleaner(self.images.size, full_confidence)
+        by_image = {number: cleaner.clean(people) for number, people in self.raw.items()}
+        # A layout that fits is no news for the artefact; `check` reports it.
+        notes += [text for text in self.recognised if not text.startswith("layout ")]
+        notes += cleaner.notes()
+        return PeopleByImage(by_image, notes, list(dict.fromkeys(self.recognised)))
+
+    def _scale_shares(self) -> None:
+        """Scale coordinates that are shares of the images' size if those of all people are."""
+        points = self.people.reshape(-1, 3)
+        values = points[visible(points), :2]
+        # Coordinates from -1 to 1 are relative to the middle of the image, in an unknown unit.
+        if are_shares(values.ravel()) and (values < 0).mean() < 0.1:
+            factors = (*self.images.size, 1.0)
+            self.raw = {number: people * factors for number, people in self.raw.items()}
+            width, height = self.images.size
+            self.recognised.append(
+                f"coordinates are shares of the image's size, scaled to {width}x{height} pixels"
+            )
+
+
+def _recognise_layout(
+    reading: _Reading, read_as: Callable[[str], _Reading], folder: Path
+) -> _Reading:
+    """Compare the assumed layout with the people's bones; read again if another one fits.
+
+    Raises UserError if no layout of the same number of points fits.
+
+    Args:
+        reading: all people of a camera.
+        read_as: reads them in the named layout.
+        folder: folder of keypoints, for messages.
+    """
+    share = compare_bones(reading.people)
+    if reading.layout is not None or len(reading.assumed) != 1 or share is None:
+        return reading
+    (assumed,) = reading.assumed
+    if share <= CERTAIN_BONE_SHARE:
+        reading.recognised.append(f"layout {assumed}")
+        return reading
+    count = len(layouts()[assumed].points)
+    readings = {
+        name: read_as(name)
+        for name, layout in layouts().items()
+        if name != assumed and len(layout.points) == count
+    }
+    shares = {name: compare_bones(other.people) or np.inf for name, other in readings.items()}
+    best = min(shares, key=lambda name: shares[name], default=None)
+    if best is not None and shares[best] < min(MAX_SHARE_OF_OTHER * share, MAX_BONE_SHARE):
+        found = readings[best]
+        found.recognised.append(f"{count} points are {best}, not {assumed}, by their bones")
+        return found
+    if share > MAX_BONE_SHARE:
+        raise UserError(
+            f"{folder}: the {count} keypoints of camera {reading.images.name} fit none of the "
+            f"layouts {', '.join([assumed, *readings])}: in {assumed}, bones are {share:.2f} times "
+            "as long as the distance of two points, expected less than 1; name the layout in "
+            "detections.keypoint_layout, or write the keypoints in one of "
+            f"{', '.join(sorted(layouts()))}"
+        )
+    reading.recognised.append(f"layout {assumed} (uncertain by its bones)")
+    return reading
 
 
 def find_camera_file(folder: Path, camera: str) -> tuple[Path, KeypointReader] | None:
@@ -173,28 +288,36 @@ def has_keypoints(folder: Path, camera: str) -> bool:
     return find_camera_file(folder, camera) is not None or (folder / camera).is_dir()
 
 
-def read_camera(folder: Path, images: CameraImages, *, full_confidence: float) -> PeopleByImage:
+def read_camera(
+    folder: Path, images: CameraImages, *, full_confidence: float, layout: str | None = None
+) -> PeopleByImage:
     """Read all keypoints of one camera.
 
-    Raises UserError if files can be loaded and none can be used, or for two files of one image.
-    Files that cannot be loaded are noted.
+    Raises UserError if files can be loaded and none can be used, for two files of one image, or for
+    points whose layout cannot be recognised. Files that cannot be loaded are noted.
 
     Args:
         folder: folder of keypoints of the sequence.
         images: the camera's images.
         full_confidence: confidence that counts as 1.
+        layout: name of the layout of the points, None = recognised.
     """
-    reading = _Reading(KeypointCleaner(images.size, full_confidence))
-    whole = find_camera_file(folder, images.name)
-    if whole is not None:
-        _add_camera_file(reading, images, *whole)
-    elif (folder / images.name).is_dir():
-        _add_image_files(reading, folder / images.name, images)
-    else:
-        reading.people.notes.append(
-            f"no keypoints {folder.name}/{images.name}/ or {folder.name}/{images.name}.json"
-        )
-    return reading.finish(folder, images.name)
+
+    def read_as(name: str | None) -> _Reading:
+        reading = _Reading(images, name)
+        whole = find_camera_file(folder, images.name)
+        if whole is not None:
+            _add_camera_file(reading, *whole)
+        elif (folder / images.name).is_dir():
+            _add_image_files(reading, folder / images.name)
+        else:
+            reading.notes.append(
+                f"no keypoints {folder.name}/{images.name}/ or {folder.name}/{images.name}.json"
+            )
+        return reading
+
+    reading = _recognise_layout(read_as(layout), read_as, folder)
+    return reading.finish(folder, images.name, full_confidence)
 
 
 def read_files(
@@ -203,50 +326,56 @@ def read_files(
     images: CameraImages,
     *,
     full_confidence: float,
+    layout: str | None = None,
 ) -> PeopleByImage:
     """Read the JSON file of each image number, None = there is none; raises as read_camera."""
-    reading = _Reading(KeypointCleaner(images.size, full_confidence))
     reader = next(reader for reader in readers() if reader.load is read_json)
-    _add_files(reading, files, reader)
-    return reading.finish(folder, images.name)
+
+    def read_as(name: str | None) -> _Reading:
+        reading = _Reading(images, name)
+        _add_files(reading, files, reader)
+        return reading
+
+    reading = _recognise_layout(read_as(layout), read_as, folder)
+    return reading.finish(folder, images.name, full_confidence)
 
 
-def _add_camera_file(
-    reading: _Reading, images: CameraImages, path: Path, reader: KeypointReader
-) -> None:
+def _add_camera_file(reading: _Reading, path: Path, reader: KeypointReader) -> None:
     """Read one file of all images and sort its people by image."""
     try:
         loaded = reader.load(path)
     except UnreadableDetections as error:
-        reading.people.notes.append(f"{short_name(path)} {error}")
+        reading.notes.append(f"{short_name(path)} {error}")
         return
-    try:
-        content = read_people(loaded, reader.load, one_image=False)
-    except UnreadableDetections as error:
-        reading.faults.append(f"{short_name(path)} {error}")
+    content = reading.parse(loaded, reader, path, one_image=False)
+    if content is None:
         return
-    by_image, absent = sort_by_image(content, images)
+    by_image, absent, remark = sort_by_image(content, reading.images)
     for number, persons in by_image.items():
-        people = np.stack(persons) if persons else NOBODY
-        reading.people.by_image[number] = reading.cleaner.clean(people)
+        reading.raw[number] = np.stack(persons) if persons else NOBODY
     reading.used |= not content.is_useless
     reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
-    note_absent(reading.people.notes, absent, images, short_name(path))
+    if remark:
+        reading.recognised.append(f"images of {short_name(path)} are {remark}")
+    note_absent(reading.notes, absent, reading.images, short_name(path))
 
 
-def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> None:
+def _add_image_files(reading: _Reading, folder: Path) -> None:
     """Read the files of a camera's folder."""
+    images = reading.images
     by_name, reader = find_image_files(folder) or ({}, readers()[0])
-    places = images.match_names(by_name)
+    places, remark = images.recognise_names(by_name)
     repeated = [] if places else find_repeated_number(by_name)
     if repeated:
         first, second = (by_name[name].name for name in repeated[:2])
         reading.faults.append(f"one image has two keypoint files, {first} and {second}; keep one")
+    if remark:
+        reading.recognised.append(f"keypoint files are {remark}")
     by_number = {place: by_name[name] for name, place in places.items()}
     numbers = [int(images.number[t]) for t in images.sets]
     _add_files(reading, {n: by_number.get(n) for n in numbers}, reader)
     absent = [name for name in by_name if places.get(name) not in images.recorded]
-    note_unmatched(reading.people.notes, "keypoint files", absent)
+    note_unmatched(reading.notes, "keypoint files", absent)
 
 
 def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: KeypointReader) -> None:
@@ -261,57 +390,90 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
         except UnreadableDetections:
             reading.broken.append(short_name(path))
             continue
-        try:
-            content = read_people(loaded, reader.load, one_image=True)
-        except UnreadableDetections as error:
-            reading.faults.append(f"{short_name(path)} {error}")
+        content = reading.parse(loaded, reader, path, one_image=True)
+        if content is None:
             continue
         reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
         if content.results or not content.faults:
-            people = np.stack([p for _, p in content.results]) if content.results else NOBODY
-            reading.people.by_image[number] = reading.cleaner.clean(people)
+            reading.raw[number] = (
+                np.stack([p for _, p in content.results]) if content.results else NOBODY
+            )
             reading.used = True
     if missing:
-        reading.people.notes.append(f"no keypoint file for {missing} images")
+        reading.notes.append(f"no keypoint file for {missing} images")
+
+
+@dataclass
+class KeypointPreview:
+    """Some keypoints of one camera."""
+
+    notes: list[str] = field(default_factory=list)
+    """Messages for the user about faults."""
+    recognised: list[str] = field(default_factory=list)
+    """What was recognised by the content."""
 
 
 def preview_keypoints(
-    folder: Path, camera: str, *, size: tuple[int, int], full_confidence: float
-) -> list[str]:
-    """Faults in the beginning of one camera's file, or in its first file of one image.
+    folder: Path, images: CameraImages, *, full_confidence: float, layout: str | None = None
+) -> KeypointPreview:
+    """Read the beginning of one camera's file, or some of its files of one image.
 
     Args:
         folder: folder of keypoints of the sequence.
-        camera: name of the camera.
-        size: width and height of its colour images.
+        images: the camera's images.
         full_confidence: confidence that counts as 1.
+        layout: name of the layout of the points, None = recognised.
     """
-    whole = find_camera_file(folder, camera)
-    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
+    preview = KeypointPreview()
+    whole = find_camera_file(folder, images.name)
+    single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
     if whole is not None:
-        path, reader = whole
+        paths, reader = [whole[0]], whole[1]
     elif single is not None:
-        path, reader = min(single[0].values()), single[1]
+        files = sorted(single[0].values())
+        paths, reader = files[:: -(-len(files) // FILES_PREVIEWED)], single[1]
+        _, remark = images.recognise_names(single[0])
+        preview.recognised += [f"files {remark}"] if remark else []
     else:
-        return []
-    try:
-        loaded = read_head(path) if reader.load is read_json else reader.load(path)
-        if loaded is None:
-            return []
-        parsed = read_people(loaded, reader.load, one_image=whole is None)
-    except UnreadableDetections as error:
-        return [f"{path} {error}"]
-    notes, cleaner = [], KeypointCleaner(size, full_confidence)
-    if parsed.faults:
-        notes.append(
-            f"{path}: {len(parsed.faults)} of its first {parsed.entries} people cannot be used "
-            f"(first: {parsed.faults[0]})"
-        )
-    if parsed.results:
-        cleaner.clean(np.stack([person for _, person in parsed.results]))
-        if not cleaner.seen:
-            notes.append(
-                f"{path}: none of its first {len(parsed.results)} people has a point with numbers "
-                "and a confidence above 0; write the keypoints again"
+        return preview
+    loaded: dict[Path, Any] = {}
+    for path in paths:
+        try:
+            content = read_head(path) if reader.load is read_json else reader.load(path)
+        except UnreadableDetections as error:
+            preview.notes.append(f"{path} {error}")
+            continue
+        if content is not None:
+            loaded[path] = content
+
+    def read_as(name: str | None) -> _Reading:
+        reading = _Reading(images, name)
+        entries, faults = 0, []
+        for number, (path, content) in enumerate(loaded.items()):
+            parsed = reading.parse(content, reader, path, one_image=whole is None)
+            if parsed is not None:
+                entries, faults = entries + parsed.entries, faults + parsed.faults
+                people = [person for _, person in parsed.results]
+                reading.raw[number] = np.stack(people) if people else NOBODY
+                reading.used = True
+        if faults:
+            reading.notes.append(
+                f"{len(faults)} of its first {entries} people cannot be used (first: {faults[0]})"
             )
-    return notes + [f"{path}: {note}" for note in cleaner.notes()]
+        return reading
+
+    try:
+        reading = _recognise_layout(read_as(layout), read_as, folder)
+        found = reading.finish(folder, images.name, full_confidence)
+    except UserError as error:
+        preview.notes.append(str(error))
+        return preview
+    preview.recognised += found.recognised
+    where = next(iter(loaded), folder)
+    preview.notes += [f"{where}: {note}" for note in found.notes if note not in found.recognised]
+    if len(reading.people) and not visible(reading.people).any():
+        preview.notes.append(
+            f"{where}: none of its first {len(reading.people)} people has a point with numbers "
+            "and a confidence above 0; write the keypoints again"
+        )
+    return preview

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from intercap_core.formats.detections.class_names import MAX_LABEL
 from intercap_core.formats.detections.instance import (
@@ -52,15 +54,7 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     stored = encoded_size(content)
     if stored is None or stored[0] * stored[1] > MAX_PIXELS:
         raise DamagedImage("is no image" if stored is None else "is too large an image")
-    kind = cv2.IMREAD_UNCHANGED if file.numbered else cv2.IMREAD_GRAYSCALE
-    try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
-    except cv2.error:  # the image takes more memory than OpenCV allows
-        image = None
-    if image is None:
-        raise DamagedImage("is no image")
-    if image.ndim == 3:
-        image = image[..., :3].max(-1)
+    image = _decode(content, file.numbered)
     try:
         scale_to((image.shape[1], image.shape[0]), size)
     except ValueError:
@@ -74,6 +68,36 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
         if instance is not None:
             instances.append(instance)
     return instances
+
+
+def _decode(content: bytes, numbered: bool) -> np.ndarray:
+    """The values (H, W) of a mask file: grey levels, or numbers of instances.
+
+    The numbers are the indices of a palette (VOC, DAVIS) and one for each colour except black. The
+    alpha channel of a picture that is cut out is its mask. Raises :class:`DamagedImage`.
+    """
+    kind = cv2.IMREAD_UNCHANGED if numbered else cv2.IMREAD_GRAYSCALE
+    try:
+        if numbered and content[25:26] == b"\x03":  # a PNG's type of colour: palette
+            indices = np.asarray(Image.open(io.BytesIO(content)))
+            is_void = (indices == 255) & bool(((indices > 0) & (indices < 255)).any())
+            return np.where(is_void, 0, indices).astype(np.uint16)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
+    except (cv2.error, OSError, SyntaxError, ValueError):  # or it takes too much memory
+        image = None
+    if image is None:
+        raise DamagedImage("is no image")
+    if image.ndim == 2:
+        return image
+    if image.shape[2] == 4 and np.ptp(image[..., 3]):
+        return np.where(image[..., 3] >= MASK_THRESHOLD, 255, 0).astype(np.uint8)
+    colours = image[..., :3]
+    level = colours.max(-1)
+    brightest = colours.reshape(-1, 3)[colours.sum(-1, dtype=int).argmax()].astype(float)
+    shade = brightest * (level / max(brightest.max(), 1))[..., None]
+    if np.abs(colours - shade).max() < 4:  # one colour, whose outline may be smooth
+        return level
+    return colours.astype(np.int64) @ (1, 1 << 16, 1 << 32)
 
 
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:

@@ -208,14 +208,14 @@ def test_confidence_is_cut_and_scaled():
 @pytest.mark.parametrize("value", [0.0, None])
 def test_the_preview_notes_people_without_points(tmp_path, value):
     empty = whole(image_id=0) | {"keypoints": [value] * 399}
-    look = partial(preview_keypoints, tmp_path, "k1", size=SIZE, full_confidence=1.0)
+    look = partial(preview_keypoints, tmp_path, images(), full_confidence=1.0)
     write(tmp_path / "k1.json", [empty, empty])
-    (note,) = look()
+    (note,) = look().notes
     assert "k1.json: none of its first 2 people has a point" in note
     write(tmp_path / "k1.json", [empty, whole(image_id=1)])
-    assert look() == []
+    assert look().notes == []
     write(tmp_path / "k1.json", [])
-    assert look() == []
+    assert look().notes == []
 
 
 def test_people_of_zeros_or_of_shares_are_nobody():

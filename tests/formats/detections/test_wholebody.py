@@ -68,9 +68,15 @@ def only(content, **options) -> np.ndarray:
 def test_every_layout_names_known_points_once():
     for layout in layouts().values():
         assert len(layout.points) == len(set(layout.points))
-        assert set(layout.points) - set(KEYPOINT_NAMES) <= {"head", "middle_of_shoulders"}
-    counts = sorted(len(layout.points) for layout in layouts().values())
-    assert counts == [17, 23, 26, 133, 134, 136]
+        unused = {"head", "middle_of_shoulders", "upper_neck", "spine", "thorax"}
+        unused |= {
+            f"{side}_{end}"
+            for side in ("left", "right")
+            for end in ("palm", "foot", "fingers", "thumb")
+        }
+        assert set(layout.points) - set(KEYPOINT_NAMES) <= unused
+    counts = sorted({len(layout.points) for layout in layouts().values()})
+    assert counts == [17, 23, 25, 26, 133, 134, 136]
     assert set(KEYPOINT_NAMES) - set(WHOLE_BODY) == {"neck", "mid_hip"}
 
 
@@ -157,9 +163,9 @@ def test_a_stated_layout_is_used_among_two_of_one_length(monkeypatch, content):
 
 def test_a_layout_that_does_not_fit_is_refused(monkeypatch):
     for layout, count, words in (
-        ("unknown", 133, "expected one of coco, "),
+        ("unknown", 133, "expected one of body_25, body_25b, coco, "),
         ("coco", 133, "expected the 17 of layout coco"),
-        (None, 50, "expected one of 17, 23, 26, 133, 134, 136"),
+        (None, 50, "expected one of 17, 23, 25, 26, 133, 134, 136"),
     ):
         with pytest.raises(ValueError, match=words):
             find_layout(count, layout)

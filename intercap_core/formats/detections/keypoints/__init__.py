@@ -8,14 +8,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS
+from intercap_core.body.keypoints import (
+    BODY,
+    KEYPOINT_INDEX,
+    KEYPOINT_NAMES,
+    LIMB_BONES,
+    NUM_KEYPOINTS,
+    of_side,
+)
 from intercap_core.formats.detections.coco import (
     DetectionFile,
     UnreadableDetections,
@@ -42,8 +49,19 @@ class KeypointLayout:
     only if another layout has the same number of points."""
 
 
-# Keypoints (135, 3) of each person: x, y (px) and confidence as written.
-PeopleFile = DetectionFile[np.ndarray]
+@dataclass
+class PeopleFile(DetectionFile[np.ndarray]):
+    """Keypoints (135, 3) of each person of one file: x, y (px) and confidence as written."""
+
+    assumed: set[str] = field(default_factory=set)
+    """Layouts that were selected by the number of points alone."""
+
+    def layout_of(self, count: int, name: str | None) -> KeypointLayout:
+        """The layout of a person, as :func:`find_layout`; records what was assumed."""
+        layout = find_layout(count, name)
+        if name is None:
+            self.assumed.add(layout.name)
+        return layout
 
 
 @dataclass(frozen=True)
@@ -56,9 +74,13 @@ class KeypointReader:
     """Content of the files, for messages."""
     recognises: Callable[[Any], bool]
     """Whether loaded content is of this form."""
-    read: Callable[[Any, bool], PeopleFile]
-    """Reads loaded content. The second argument is True for a file of one image, whose people need
-    not state their image. Raises :class:`UnreadableDetections` if nothing can be used."""
+    read: Callable[[Any, bool, str | None], PeopleFile]
+    """Reads loaded content. Raises :class:`UnreadableDetections` if nothing can be used. Arguments:
+
+    - the content;
+    - True for a file of one image, whose people need not state their image;
+    - name of the layout according to the settings, None = the file or the number of points decides.
+    """
     camera_files: tuple[str, ...] = ()
     """Names of files for all images of a camera, such as ``{camera}.json``; () = there are none."""
     image_files: tuple[str, ...] = ()
@@ -128,6 +150,54 @@ def find_layout(count: int, name: str | None = None) -> KeypointLayout:
     return matching[0]
 
 
+# Bones of any body layout, by the names of their ends.
+_BONES = [
+    *of_side("left", LIMB_BONES), *of_side("right", LIMB_BONES),
+    *of_side("left", (("shoulder", "hip"), ("eye", "ear"), ("big_toe", "small_toe"))),
+    *of_side("right", (("shoulder", "hip"), ("eye", "ear"), ("big_toe", "small_toe"))),
+    ("neck", "left_shoulder"), ("neck", "right_shoulder"), ("nose", "neck"),
+    ("nose", "left_eye"), ("nose", "right_eye"), ("left_hip", "right_hip"),
+    ("mid_hip", "left_hip"), ("mid_hip", "right_hip"),
+]  # fmt: skip
+BONE_QUANTILE = 0.75  # a point that is far off spoils the few bones that end in it
+_BONE_ENDS = np.array([[KEYPOINT_INDEX[end] for end in bone] for bone in _BONES])
+
+
+def visible(points: np.ndarray) -> np.ndarray:
+    """Mask (...) of points (..., 3) with finite x, y off the corner and a confidence above 0."""
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(points).all(-1) & (points[..., 2] > 0) & (points[..., :2] != 0).any(-1)
+
+
+def compare_bones(people: np.ndarray) -> float | None:
+    """Length of long bones (upper quartile) as a share of the median distance of two body points.
+
+    A wrong layout joins points at random, so its share is near 1. Returns the median over people;
+    None if nobody has enough points.
+
+    Args:
+        people: keypoints (P, 135, 3) in the shared order.
+    """
+    body = people[:, BODY]
+    seen = visible(body)
+    points = np.where(seen[..., None], body[..., :2], np.nan)[seen.sum(1) >= 8]
+    extent = np.nanmax(points, axis=1, initial=-np.inf) - np.nanmin(points, axis=1, initial=np.inf)
+    points = points[extent.min(-1) > 0.02 * extent.max(-1)]  # points on a line show no bones
+    if not len(points):
+        return None
+    apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+    first, second = np.triu_indices(points.shape[1], 1)
+    bones = apart[:, _BONE_ENDS[:, 0], _BONE_ENDS[:, 1]]
+    known = np.isfinite(bones).sum(1) >= 5
+    if not known.any():
+        return None
+    bones, pairs = bones[known], apart[known][:, first, second]
+    share = np.nanquantile(bones, BONE_QUANTILE, axis=1) / np.maximum(
+        np.nanmedian(pairs, axis=1), 1e-9
+    )
+    return float(np.median(share))
+
+
 def to_shared(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Order points of a detector as the 135 keypoints of ``body.keypoints``.
 
@@ -147,7 +217,11 @@ def to_shared(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 
 
 def read_people(
-    content: Any, load: Callable[[Path], Any] = read_json, *, one_image: bool
+    content: Any,
+    load: Callable[[Path], Any] = read_json,
+    *,
+    one_image: bool,
+    layout: str | None = None,
 ) -> PeopleFile:
     """Read loaded content by the reader that recognises it.
 
@@ -157,6 +231,7 @@ def read_people(
         content: content as ``load`` returns it.
         load: function that loaded the file.
         one_image: the file is of one image.
+        layout: name of the layout according to the settings.
     """
     possible = [
         reader
@@ -165,6 +240,6 @@ def read_people(
     ]
     for reader in possible:
         if reader.recognises(content):
-            return reader.read(content, one_image)
+            return reader.read(content, one_image, layout)
     expected = ", ".join(reader.expects for reader in possible)
     raise UnreadableDetections(f"holds {quoted(content)}, expected {expected}")

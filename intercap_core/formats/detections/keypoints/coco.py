@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from intercap_core.body.keypoints import BODY as OPENPOSE_BODY
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
 from intercap_core.formats.detections.coco import (
     ImageKey,
     UnreadableDetections,
     image_of,
-    names_by_id,
+    listed_images,
     read_listed_images,
 )
 from intercap_core.formats.detections.keypoints import (
@@ -32,7 +33,6 @@ from intercap_core.formats.detections.keypoints import (
     KeypointLayout,
     KeypointReader,
     PeopleFile,
-    find_layout,
     layouts,
     to_shared,
 )
@@ -62,8 +62,28 @@ DWPOSE_BODY = (
 )  # fmt: skip
 WHOLE_BODY = (*BODY, *FEET, *FACE, *LEFT, *RIGHT)
 
+# OpenPose's experimental BODY_25B: COCO's points, neck and top of the head, feet.
+BODY_25B = (*BODY, "upper_neck", "head", *FEET)
+# Human3.6M, as VideoPose3D and mmpose order it. Its neck lies at the chin.
+H36M = (
+    "mid_hip", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle",
+    "spine", "thorax", "upper_neck", "head", "left_shoulder", "left_elbow", "left_wrist",
+    "right_shoulder", "right_elbow", "right_wrist",
+)  # fmt: skip
+# Kinect for Windows SDK 2.0, JointType; NTU RGB+D.
+KINECT_V2 = (
+    "mid_hip", "spine", "upper_neck", "head", "left_shoulder", "left_elbow", "left_wrist",
+    "left_palm", "right_shoulder", "right_elbow", "right_wrist", "right_palm", "left_hip",
+    "left_knee", "left_ankle", "left_foot", "right_hip", "right_knee", "right_ankle", "right_foot",
+    "neck", "left_fingers", "left_thumb", "right_fingers", "right_thumb",
+)  # fmt: skip
+
 # Names are those of mmpose's data sets, where it has them.
 LAYOUTS = (
+    KeypointLayout("body_25", KEYPOINT_NAMES[OPENPOSE_BODY], is_default=True),
+    KeypointLayout("body_25b", BODY_25B),
+    KeypointLayout("kinect_v2", KINECT_V2),
+    KeypointLayout("h36m", H36M),
     KeypointLayout("coco", BODY, is_default=True),
     KeypointLayout("coco_feet", (*BODY, *FEET), is_default=True),
     KeypointLayout("coco_wholebody", WHOLE_BODY, is_default=True),
@@ -77,6 +97,9 @@ _PARTS = {
 }  # fmt: skip
 
 
+LayoutOf = Callable[[dict[str, Any]], str | None]  # name of the layout that an entry states
+
+
 def _entries(content: Any) -> Any:
     """The list of people or frames."""
     if isinstance(content, dict):
@@ -84,20 +107,22 @@ def _entries(content: Any) -> Any:
     return content
 
 
-def _read(content: Any, one_image: bool) -> PeopleFile:
+def _read(content: Any, one_image: bool, layout: str | None = None) -> PeopleFile:
     """Read the people in their order; entries that cannot be used are left out with a reason."""
-    entries, layout = _entries(content), _stated_layout(content)
+    entries, of_file = _entries(content), _stated_layout(content)
+
+    def layout_of(entry: dict[str, Any]) -> str | None:
+        return layout or entry.get(LAYOUT_KEY, of_file)
+
     result = PeopleFile()
     if entries and all(isinstance(e, dict) and "instances" in e for e in entries):
-        _read_frames(result, entries, layout, from_1=isinstance(content, dict))
+        _read_frames(result, entries, layout_of, from_1=isinstance(content, dict))
         return result
-    files: dict[int, str] = {}
     if isinstance(content, dict):
         result.images = read_listed_images(content)
-        files = names_by_id(result.images or [])
-    image = partial(image_of, files=files, one_image=one_image)
+    image = partial(image_of, listed=listed_images(result.images), one_image=one_image)
     for index, entry in enumerate(entries):
-        _add(result, entry, f"entry {index}", image, layout)
+        _add(result, entry, f"entry {index}", image, layout_of)
     return result
 
 
@@ -122,7 +147,7 @@ def _stated_layout(content: Any) -> str | None:
 
 
 def _read_frames(
-    result: PeopleFile, frames: list[dict[str, Any]], layout: str | None, *, from_1: bool
+    result: PeopleFile, frames: list[dict[str, Any]], layout_of: LayoutOf, *, from_1: bool
 ) -> None:
     """Add the people of a video's frames. mmpose's demo counts from 1, its inferencer from 0."""
     first = 0 if not from_1 or 0 in [frame.get("frame_id") for frame in frames] else 1
@@ -138,7 +163,7 @@ def _read_frames(
         result.images.append(key)
         for index, person in enumerate(people):
             where = f"frame {number}, person {index}"
-            _add(result, person, where, lambda _, key=key: key, layout)  # type: ignore[misc]
+            _add(result, person, where, lambda _, key=key: key, layout_of)  # type: ignore[misc]
 
 
 def _add(
@@ -146,28 +171,31 @@ def _add(
     entry: Any,
     where: str,
     image: Callable[[dict[str, Any]], ImageKey],
-    layout: str | None,
+    layout_of: LayoutOf,
 ) -> None:
-    """Add one person to ``result``, or a fault; ``image`` returns the image of an entry."""
+    """Add one person to ``result``, or a fault.
+
+    ``image`` and ``layout_of`` return the image and the stated layout of an entry.
+    """
     key = ImageKey(None, None)
     result.entries += 1
     try:
         if not isinstance(entry, dict):
             raise ValueError(f"expected a person, found {quoted(entry)}")
         key = image(entry)
-        result.results.append((key, _person(entry, entry.get(LAYOUT_KEY, layout))))
+        result.results.append((key, _person(result, entry, layout_of(entry))))
     except ValueError as error:
         result.add_fault(where, key, error)
 
 
-def _person(entry: dict[str, Any], layout: str | None) -> np.ndarray:
+def _person(result: PeopleFile, entry: dict[str, Any], layout: str | None) -> np.ndarray:
     """Keypoints (135, 3) of one person; raises ValueError with the reason if there are none."""
     if "keypoints" not in entry:
         raise ValueError(f"has no 'keypoints' but {quoted(entry)}")
     points = _points("keypoints", entry["keypoints"], entry.get("keypoint_scores"))
     parts = {key: names for key, names in _PARTS.items() if entry.get(key)}
     if not parts:
-        return to_shared(points, find_layout(len(points), layout).points)
+        return to_shared(points, result.layout_of(len(points), layout).points)
     lists: list[tuple[str, np.ndarray, tuple[str, ...]]] = [("keypoints", points, BODY)]
     lists += [(key, _points(key, entry[key], None), names) for key, names in parts.items()]
     for key, values, names in lists:

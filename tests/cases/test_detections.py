@@ -1,0 +1,274 @@
+"""Keypoints and candidates as people have them: public bug reports, and members of each kind."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from intercap_core.body.keypoints import KEYPOINT_INDEX
+from intercap_core.commands.check_recordings import RecordingFindings, check_row
+from intercap_core.errors import UserError
+from intercap_core.formats.detections import candidate_files, keypoint_files
+from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.keypoints import layouts, read_people
+from intercap_core.formats.detections.mask_files import MaskFile, read_masks
+from intercap_core.project import Project, load_project
+from tests.conftest import PROJECT_ROOT
+
+SEQUENCE, SIZE = "s01_box", (320, 240)
+# A standing person, by name: x, y.
+STANDING = {
+    "nose": (160, 40), "neck": (160, 60), "mid_hip": (160, 120), "head": (160, 25),
+    "upper_neck": (160, 52), "spine": (160, 90), "thorax": (160, 62),
+} | {
+    f"{side}_{name}": (160 + sign * x, y)
+    for side, sign in (("left", 1), ("right", -1))
+    for name, x, y in (
+        ("eye", 4, 35), ("ear", 8, 37), ("shoulder", 20, 62), ("elbow", 27, 90), ("wrist", 30, 115),
+        ("hip", 10, 121), ("knee", 12, 165), ("ankle", 13, 205), ("heel", 12, 212),
+        ("big_toe", 18, 214), ("small_toe", 21, 213), ("palm", 31, 122), ("fingers", 32, 130),
+        ("thumb", 29, 124), ("foot", 18, 214),
+    )
+}  # fmt: skip
+
+
+def open_case(name: str, folder: Path) -> Project:
+    """Copy a case to ``folder`` and open it; skips the test where the cases are not."""
+    cases = Path(os.environ.get("INTERCAP_CASES", PROJECT_ROOT.parent / "shared" / "cases"))
+    if not (cases / name).is_dir():
+        pytest.skip(f"{cases / name} is not here; set INTERCAP_CASES to the folder that holds it")
+    shutil.copytree(cases / name, folder / name, copy_function=shutil.copyfile)
+    for path in [folder / name, *(folder / name).rglob("*")]:
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    return load_project(folder / name / "config.yaml")
+
+
+def check(project: Project) -> RecordingFindings:
+    found = check_row(project, project.sequences[SEQUENCE])
+    assert not found.faults
+    return found
+
+
+def camera(count: int, stems: tuple[str, ...] = (), first: int | None = None) -> CameraImages:
+    number = np.arange(count)
+    times = number * 33_333
+    return CameraImages("k1", SIZE, number, times, frozenset(range(count)), stems, first)
+
+
+def person_of(layout: str) -> list[float]:
+    return [v for name in layouts()[layout].points for v in (*STANDING[name], 0.9)]
+
+
+def write_people(folder: Path, names: list[str], person: list[float]) -> None:
+    (folder / "k1").mkdir(parents=True)
+    for n, name in enumerate(names):
+        moved = [v + n / 10 if i % 3 == 0 else v for i, v in enumerate(person)]
+        content = {"people": [{"pose_keypoints_2d": moved}]}
+        (folder / "k1" / name).write_text(json.dumps(content))
+
+
+def read(folder: Path, images: CameraImages, **options) -> keypoint_files.PeopleByImage:
+    return keypoint_files.read_camera(folder, images, full_confidence=1.0, **options)
+
+
+def test_the_25_points_of_body_25b_are_recognised(tmp_path):
+    project = open_case("b06", tmp_path)
+    row = project.sequences[SEQUENCE]
+    found = check(project)
+    assert "keypoints: 25 points are body_25b, not body_25, by their bones" in found.summary
+    people = read(row.keypoints, camera(6)).by_image[0]
+    written = json.loads((row.keypoints / "k1" / "00000_keypoints.json").read_text())
+    raw = np.reshape(written["people"][0]["pose_keypoints_2d"], (25, 3))
+    for place, name in ((5, "left_shoulder"), (11, "left_hip"), (22, "right_big_toe")):
+        np.testing.assert_allclose(people[0, KEYPOINT_INDEX[name]], raw[place], atol=1e-4)
+    assert people[0, KEYPOINT_INDEX["neck"], 2] == 0
+
+
+def test_the_halpe_points_of_pose2sim_are_read(tmp_path):
+    project = open_case("b07", tmp_path)
+    row = project.sequences[SEQUENCE]
+    assert "keypoints: layout halpe26" in check(project).summary
+    images = CameraImages("cam01", SIZE, np.arange(20), np.arange(20), frozenset(range(20)))
+    found = read(row.keypoints, images)
+    written = json.loads((row.keypoints / "cam01" / "cam01_000007.json").read_text())
+    raw = np.reshape(written["people"][0]["pose_keypoints_2d"], (26, 3))
+    for place, name in ((5, "left_shoulder"), (18, "neck"), (25, "right_heel")):
+        np.testing.assert_allclose(
+            found.by_image[7][0, KEYPOINT_INDEX[name]], raw[place], atol=1e-4
+        )
+
+
+def test_masks_of_shares_of_the_image_are_scaled(tmp_path):
+    project = open_case("b14", tmp_path)
+    row = project.sequences[SEQUENCE]
+    assert "candidates: corners are shares of the image's size" in check(project).summary
+    found = candidate_files.read_camera(
+        row.candidates, camera(4), layout="plain", min_score=0.0, names={}
+    )
+    suitcase = found.by_image[0][0]
+    assert suitcase.label == "suitcase"
+    np.testing.assert_allclose(suitcase.box, (148, 167, 23, 55), atol=1)
+    assert any("shares of the image's size" in note for note in found.notes)
+
+
+def test_keypoint_files_numbered_from_1_beside_a_video(tmp_path):
+    project = open_case("b15", tmp_path)
+    row = project.sequences[SEQUENCE]
+    assert "files numbered from 1" in check(project).summary
+    found = read(row.keypoints, camera(20))
+    for n in (0, 19):
+        path = row.keypoints / "k1" / f"{n + 1:06d}_keypoints.json"
+        x = json.loads(path.read_text())["people"][0]["pose_keypoints_2d"][0]
+        assert found.by_image[n][0, 0, 0] == pytest.approx(x, abs=1e-4)
+    assert "keypoint files are numbered from 1" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("layout", "expected"),
+    [
+        ("body_25", "layout body_25"),
+        ("body_25b", "25 points are body_25b, not body_25, by their bones"),
+        ("kinect_v2", "25 points are kinect_v2, not body_25, by their bones"),
+        ("coco", "layout coco"),
+        ("h36m", "17 points are h36m, not coco, by their bones"),
+        ("coco_feet", "layout coco_feet"),
+        ("halpe26", "layout halpe26"),
+    ],
+)
+def test_layouts_are_recognised_by_their_bones(tmp_path, layout, expected):
+    write_people(tmp_path, ["0.json", "1.json"], person_of(layout))
+    found = read(tmp_path, camera(2))
+    assert expected in found.recognised
+    knee = found.by_image[0][0, KEYPOINT_INDEX["left_knee"], :2]
+    np.testing.assert_allclose(knee, STANDING["left_knee"])
+    stated = read(tmp_path, camera(2), layout=layout)
+    np.testing.assert_array_equal(stated.by_image[1], found.by_image[1])
+
+
+def test_points_in_an_unknown_order_are_refused_unless_a_layout_is_stated(tmp_path):
+    order = np.random.default_rng(1).permutation(26)
+    shuffled = np.reshape(person_of("halpe26"), (26, 3))[order].ravel().tolist()
+    write_people(tmp_path, ["0.json"], shuffled)
+    with pytest.raises(UserError, match="26 keypoints of camera k1 fit none of the layouts"):
+        read(tmp_path, camera(1))
+    assert read(tmp_path, camera(1), layout="halpe26").by_image[0].shape == (1, 135, 3)
+
+
+@pytest.mark.parametrize(
+    ("name_of", "remark"),
+    [
+        (lambda n: f"frame_{n:04d}_k1.json", None),
+        (lambda n: f"k1_{n:06d}_v2_keypoints.json", None),
+        (lambda n: f"{n + 1:06d}.json", "numbered from 1"),
+        (lambda n: f"cam1_{n + 1:04d}_2d.json", "numbered from 1"),
+        (lambda n: f"{n + 500}.json", "numbered from 500"),
+        (lambda n: f"{round(n * 33.333):06d}.json", "named by time"),
+        (lambda n: f"{1616161616000 + round(n * 33.333)}.json", "named by time"),
+        (lambda n: f"{12 + n / 30:.4f}.json", "named by time"),
+        (lambda n: f"{2 * n:04d}.json", "named by time"),
+        (lambda n: f"{n:04d}_{1616161616000 + 33 * n}.json", None),
+    ],
+)
+def test_the_number_of_an_image_is_found_in_its_name(tmp_path, name_of, remark):
+    names = [name_of(n) for n in range(12)]
+    write_people(tmp_path, names, person_of("body_25"))
+    found = read(tmp_path, camera(12))
+    noses = [found.by_image[n][0, 0, 0] for n in range(12)]
+    np.testing.assert_allclose(noses, 160 + np.arange(12) / 10)
+    assert [note for note in found.notes] == ([f"keypoint files are {remark}"] if remark else [])
+
+
+def test_numbers_that_may_count_from_1_are_noted_and_can_be_stated(tmp_path):
+    write_people(tmp_path, [f"{n + 1:04d}.json" for n in range(9)], person_of("body_25"))
+    found = read(tmp_path, camera(10))
+    assert any("begin at 1: set detections.keypoint_first_number" in note for note in found.notes)
+    assert 0 not in found.by_image
+    stated = read(tmp_path, camera(10, first=1))
+    assert stated.by_image[0][0, 0, 0] == 160 and 9 not in stated.by_image
+
+
+def test_ids_of_a_data_set_that_count_from_1(tmp_path):
+    entries = [
+        {"image_id": n + 1, "keypoints": np.add(person_of("coco"), n).tolist()} for n in range(5)
+    ]
+    (tmp_path / "k1.json").write_text(json.dumps(entries))
+    found = read(tmp_path, camera(5))
+    assert [found.by_image[n][0, 0, 0] for n in range(5)] == [160, 161, 162, 163, 164]
+    assert any("numbered from 1" in note for note in found.notes)
+
+
+def test_keypoints_are_scaled_from_the_stated_size_or_from_shares(tmp_path):
+    point = np.reshape(person_of("coco"), (17, 3))
+    forms = {
+        "half": (point * (0.5, 0.5, 1), {"width": 160, "height": 120}),
+        "shares": (point / (*SIZE, 1), {}),
+        "other": (point, {"width": 240, "height": 320}),
+    }
+    for name, (points, size) in forms.items():
+        content = {
+            "images": [{"id": 0} | size],
+            "annotations": [{"image_id": 0, "keypoints": points.ravel().tolist()}],
+        }
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "k1.json").write_text(json.dumps(content))
+    half, shares = (read(tmp_path / name, camera(1)) for name in ("half", "shares"))
+    np.testing.assert_allclose(half.by_image[0][0, 0, :2], STANDING["nose"], atol=0.6)
+    np.testing.assert_allclose(shares.by_image[0][0, 0, :2], STANDING["nose"], atol=1e-3)
+    assert "scaled from (160, 120) pixels" in half.recognised
+    with pytest.raises(UserError, match="240x320"):
+        read(tmp_path / "other", camera(1))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"images": [{"id": 0, "width": 1, "height": 1}]}, "1x1 pixels"),
+        ({"images": [{"id": 0, "width": 240, "height": 320}]}, "240x320 pixels"),
+        ({"segmentation": []}, "its mask is empty"),
+        ({"segmentation": [[500, 300, 510, 300, 510, 310]]}, "its mask is empty"),
+        ({"segmentation": {"size": [240, 320], "counts": [240 * 320]}}, "its mask is empty"),
+    ],
+)
+def test_candidates_that_cannot_be_used_are_left_out(tmp_path, change, words):
+    entry = {"image_id": 0, "category_id": 1, "segmentation": [[10, 10, 60, 10, 60, 60]]}
+    entry |= {k: v for k, v in change.items() if k == "segmentation"}
+    content = {"images": change.get("images", [{"id": 0}]), "annotations": [entry]}
+    (tmp_path / "k1.json").write_text(json.dumps(content))
+    found = candidate_files.read_camera(tmp_path, camera(1), layout="plain", min_score=0, names={})
+    assert not found.by_image.get(0) and words in found.notes[0]
+
+
+def test_instances_of_palettes_colours_and_alpha(tmp_path):
+    numbers = np.zeros((240, 320), np.uint8)
+    numbers[20:60, 30:90], numbers[100:150, 200:260] = 1, 2
+    palette = Image.fromarray(numbers, "P")
+    palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0] + [0] * 759)  # VOC's first colours
+    palette.save(tmp_path / "palette.png")
+    colours = np.zeros((240, 320, 3), np.uint8)
+    colours[numbers == 1], colours[numbers == 2] = (255, 0, 0), (0, 255, 0)
+    cv2.imwrite(str(tmp_path / "colours.png"), colours)
+    cut = np.dstack([np.full((240, 320, 3), 90, np.uint8), np.where(numbers == 1, 255, 0)])
+    cv2.imwrite(str(tmp_path / "cut.png"), cut.astype(np.uint8))
+    smooth = cv2.GaussianBlur(colours * np.uint8(numbers == 1)[..., None], (5, 5), 0)
+    cv2.imwrite(str(tmp_path / "smooth.png"), smooth)
+    first, second = (30, 20, 60, 40), (200, 100, 60, 50)
+    for name, boxes in (("palette", {first, second}), ("colours", {first, second}),
+                        ("cut", {first}), ("smooth", {first})):  # fmt: skip
+        found = read_masks(MaskFile(tmp_path / f"{name}.png", "", numbered=True), SIZE)
+        assert {instance.box for instance in found} == boxes, name
+
+
+def test_openpose_people_may_state_their_layout():
+    content = {"people": [{"pose_keypoints_2d": person_of("h36m"), "keypoint_layout": "h36m"}]}
+    found = read_people(content, one_image=True)
+    np.testing.assert_allclose(
+        found.results[0][1][KEYPOINT_INDEX["mid_hip"], :2], STANDING["mid_hip"]
+    )
+    assert not found.assumed
