@@ -20,7 +20,7 @@ from intercap_core.entries import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.mesh_files import load_mesh
+from intercap_core.geometry.rigid.mesh_files import file_vertices, load_mesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project, tidy
 
@@ -53,7 +53,7 @@ def save_surface(
     painted[ids] = True
     if _digest(path) != digest:
         raise UserError(_CHANGED.format(path))
-    in_file = np.asarray(load_mesh(Path(entry.mesh)).vertices, np.float64)
+    in_file = file_vertices(Path(entry.mesh), load_mesh(Path(entry.mesh)))
     away, nearest = cKDTree(mesh.vertices).query(np.nan_to_num(in_file, nan=1e9))
     # loading merges equal vertices: each vertex of the file gets the paint of its merged vertex
     same = away <= 1e-6 * mesh.diameter

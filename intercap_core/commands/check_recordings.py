@@ -113,11 +113,10 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
             f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
             f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
         )
-    if len(posed) < 2:
+    if len(posed) == 1:
         findings.faults.append(
-            f"{row.recordings}: {len(posed)} camera {'is' if len(posed) == 1 else 'are'} used "
-            f"({', '.join(posed) or 'none'}), expected at least 2, since points are triangulated; "
-            "add recordings and camera poses, or correct frames.cameras"
+            f"{row.recordings}: only camera {posed[0]} is used, expected at least 2, since points "
+            "are triangulated; add recordings and camera poses, or correct frames.cameras"
         )
     findings.notes += _notes_on_keypoints(project, row, posed, findings)
     findings.notes += _notes_on_candidates(project, row, posed, findings)

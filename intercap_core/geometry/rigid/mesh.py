@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import read_contact_vertices
 from intercap_core.geometry.rigid.mesh_files import (
     TEXTURE_ERRORS,
+    file_vertices,
     get_colours,
     load_mesh,
     read_mesh,
@@ -59,7 +61,7 @@ class ObjectMesh:
         """
         path = Path(entry.mesh)
         mesh = read_mesh(path)
-        in_file = np.asarray(mesh.vertices)
+        in_file, loaded = file_vertices(path, mesh), np.asarray(mesh.vertices)
         _check_size(path, mesh)
         mesh, place = _without_loose_vertices(path, mesh)
         mesh, new_id = _repair(path, mesh)
@@ -71,9 +73,9 @@ class ObjectMesh:
                 f"object {entry.name!r}: symmetry is impossible ({error}); correct it in "
                 "objects.yaml"
             ) from None
-        contact = _contact_places(entry.contact_vertices, path, in_file, place)
+        contact = _contact_places(entry.contact_vertices, path, in_file, loaded, place)
         ids = np.arange(len(mesh.vertices)) if contact is None else np.unique(new_id[contact])
-        return cls(
+        result = cls(
             entry.name,
             np.asarray(mesh.vertices, np.float64),
             np.asarray(mesh.faces, np.int32),
@@ -82,6 +84,8 @@ class ObjectMesh:
             get_colours(mesh)[:, :3].copy(),
             bool(mesh.is_watertight),
         )
+        _check_symmetry(path, result)
+        return result
 
     @cached_property
     def face_normals(self) -> np.ndarray:
@@ -219,11 +223,33 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
             f"{path}: has vertices {away:.4g} m from its origin, expected at most 50 m; move the "
             "object to its origin, in metres"
         )
+    if away > HANDLED_MAX_M + extent:
+        log.warning(
+            "%s: lies up to %.3g m from its origin, expected less than %g m; check its unit, or "
+            "move the object to its origin",
+            path, away, HANDLED_MAX_M,
+        )  # fmt: skip
     if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
         log.warning(
             "%s: is %.3g m long, people handle objects of %g to %g m; check its unit",
             path, extent, HANDLED_MIN_M, HANDLED_MAX_M,
         )  # fmt: skip
+
+
+def _check_symmetry(path: Path, mesh: ObjectMesh) -> None:
+    """Raise UserError if a symmetry moves the centre of mass, which it keeps in place."""
+    centre, symmetry = mesh.centre_of_mass, mesh.symmetry
+    elements = symmetry.elements(4)
+    moved = np.linalg.norm(elements[:, :3, :3] @ centre + elements[:, :3, 3] - centre, axis=1).max()
+    if symmetry.sphere:
+        moved = max(moved, 2 * float(np.linalg.norm(centre)))
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    if moved > 0.5 * extent:  # scans and symmetries of appearance are off by less
+        raise UserError(
+            f"object {mesh.name!r}: its symmetry moves the centre of {path} by {moved:.3g} m, "
+            f"expected less than {0.5 * extent:.2g} m; correct the offset or translation of the "
+            "symmetry (metres, frame of the mesh) in objects.yaml"
+        )
 
 
 def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
@@ -320,20 +346,29 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
 
 
 def _contact_places(
-    listed: Path | None, path: Path, vertices: np.ndarray, place: np.ndarray
+    listed: Path | None,
+    path: Path,
+    vertices: np.ndarray,
+    loaded: np.ndarray,
+    place: np.ndarray,
 ) -> np.ndarray | None:
     """Return indices (K,) of likely-contact vertices after ``place``, or None without a list.
 
     Args:
         listed: file of the list.
         path: mesh file.
-        vertices: (V, 3) of the mesh file.
-        place: (V,) new index of each vertex, -1 = removed.
+        vertices: (V, 3) as the mesh file numbers them.
+        loaded: (W, 3) of the loaded mesh, which may repeat and reorder them.
+        place: (W,) new index of each loaded vertex, -1 = removed.
     """
     if listed is None:
         return None
     ids = read_contact_vertices(Path(listed), path, vertices)
-    places = place[ids]
+    if np.array_equal(vertices, loaded, equal_nan=True):
+        places = place[ids]
+    else:
+        same = cKDTree(np.nan_to_num(loaded, nan=1e9)).query_ball_point(vertices[ids], 1e-7)
+        places = place[np.unique(np.concatenate([[], *same]).astype(int))]
     if (places < 0).all():
         raise UserError(
             f"{listed}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs "

@@ -7,9 +7,14 @@ the folder of the mesh, even if the file names another path.
 from __future__ import annotations
 
 import io
+import json
+import logging
+import re
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +51,12 @@ def load_mesh(path: Path) -> Any:
         raise UserError(f"{path}: is no mesh that is read; export it as {', '.join(SUFFIXES)}")
     content = read_bytes(path, MAX_MODEL_BYTES)
     stated = _stated_faces(path, content) if suffix == ".ply" else 0
+    if suffix == ".glb":
+        _refuse_extensions(path, content)
     try:
-        with warnings.catch_warnings():
+        if suffix == ".obj":
+            content = _absolute_indices(content)
+        with warnings.catch_warnings(), _silent_trimesh():
             warnings.simplefilter("ignore")  # NumPy's, about values that are rejected later
             mesh: Any = trimesh.load(
                 io.BytesIO(content),
@@ -73,6 +82,21 @@ def load_mesh(path: Path) -> Any:
             f"{path}: states {stated} faces, of which {len(faces)} can be read; export it again"
         )
     return mesh
+
+
+def file_vertices(path: Path, mesh: Any) -> np.ndarray:
+    """Return the vertices (V, 3) in the order in which the file numbers them.
+
+    The loaded ``mesh`` of the file has more vertices if corners of faces differ in texture
+    coordinates, and another order if the faces have several materials.
+    """
+    if path.suffix.lower() == ".obj":
+        lines = map(bytes.split, read_bytes(path, MAX_MODEL_BYTES).splitlines())
+        return np.array([words[1:4] for words in lines if words[:1] == [b"v"]], np.float64)
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    if path.suffix.lower() == ".ply" and raw is not None:  # columns by name, binary or ASCII
+        return np.column_stack([np.ravel(raw[axis]) for axis in "xyz"]).astype(np.float64)
+    return np.asarray(mesh.vertices, np.float64)
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
@@ -132,6 +156,63 @@ class _FolderResolver(trimesh.resolvers.Resolver):
 
     def namespaced(self, namespace: str) -> _FolderResolver:
         return self
+
+
+@contextmanager
+def _silent_trimesh() -> Iterator[None]:
+    """Keep trimesh's log, which repeats errors in its own words, off the terminal."""
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
+    try:
+        yield
+    finally:
+        log.disabled = before
+
+
+def _refuse_extensions(path: Path, content: bytes) -> None:
+    """Raise UserError if a GLB requires an extension that changes its geometry."""
+    try:
+        (length,) = struct.unpack("<I", content[12:16])
+        required = json.loads(content[20 : 20 + length]).get("extensionsRequired", [])
+        names = sorted(str(name) for name in required)
+    except (struct.error, ValueError, AttributeError, TypeError, RecursionError):
+        return  # trimesh names the fault
+    harmless = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
+    unread = printable(", ".join(name for name in names if not name.startswith(harmless))[:200])
+    if unread:
+        raise UserError(
+            f"{path}: requires {unread}, which is not read; export it without compression and "
+            "other extensions of glTF, or as .ply or .obj"
+        )
+
+
+def _absolute_indices(content: bytes) -> bytes:
+    """Replace relative (negative) indices of an OBJ's faces, which trimesh counts from the end.
+
+    They count back from the vertices above the face. Raises ValueError for an index before the
+    first vertex.
+    """
+    content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    if not re.search(rb"^\s*f\s[^\n#]*-\d", content, re.MULTILINE):
+        return content
+    counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    for line in content.splitlines():
+        words = line.partition(b"#")[0].split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        elif words[:1] == [b"f"]:
+            corners = [corner.split(b"/") for corner in words[1:]]
+            for corner in corners:
+                for at, (index, count) in enumerate(zip(corner, counts.values(), strict=False)):
+                    if index.startswith(b"-"):
+                        if count + int(index) < 0:
+                            raise ValueError(
+                                f"a face names vertex {int(index)} of {count} above it"
+                            )
+                        corner[at] = b"%d" % (count + 1 + int(index))
+            line = b"f " + b" ".join(b"/".join(corner) for corner in corners)
+        lines.append(line)
+    return b"\n".join(lines) + b"\n"
 
 
 def _stated_faces(path: Path, content: bytes) -> int:
