@@ -178,7 +178,7 @@ def _read_times(folder: Path) -> Any:
 def _read_candidates(folder: Path) -> Any:
     options: dict[str, Any] = {"layout": "plain", "min_score": 0.05, "names": COCO_NAMES}
     found = candidate_files.read_camera(folder, IMAGES, **options)
-    look = candidate_files.preview_candidates(folder, "k1", size=IMAGE_SIZE, names=COCO_NAMES)
+    look = candidate_files.preview_candidates(folder, IMAGES, names=COCO_NAMES)
     notes = [note for note in (*found.notes, *look.notes) if "scaled" not in note]
     return list(found.by_image.values()), list(look.labels), Notes(f"camera k1: {n}" for n in notes)
 
@@ -188,7 +188,7 @@ def _read_keypoints(folder: Path) -> Any:
     for people in found.by_image.values():
         within(0, 1, people[..., 2])
         within(-1, max(IMAGE_SIZE), people[..., :2])
-    look = keypoint_files.preview_keypoints(folder, "k1", size=IMAGE_SIZE, full_confidence=1.0)
+    look = keypoint_files.preview_keypoints(folder, IMAGES, full_confidence=1.0)
     return Notes(f"camera k1: {note}" for note in (*found.notes, *look))
 
 

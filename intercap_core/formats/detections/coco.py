@@ -258,13 +258,14 @@ def image_of(
     if not isinstance(name, str):
         name = None
     if value is None and (one_image or name is not None):
-        return ImageKey(None, name, listed[name].size if name in listed else None)
+        known = listed.get(name) if name is not None else None
+        return ImageKey(None, name, None if known is None else known.size)
     if type(value) is not int or not 0 <= value <= _LARGEST_ID:
         raise ValueError(
             "image_id must be the whole number of a colour image from 0, or its file's name, "
             f"found {quoted(value)}"
         )
-    known = listed.get(value, ImageKey(value, None))
+    known = listed.get(value) or ImageKey(value, None)
     return known if name is None else known._replace(name=name)
 
 

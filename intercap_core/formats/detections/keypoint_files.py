@@ -448,7 +448,8 @@ def preview_keypoints(
 
     def read_as(name: str | None) -> _Reading:
         reading = _Reading(images, name)
-        entries, faults = 0, []
+        entries = 0
+        faults: list[str] = []
         for number, (path, content) in enumerate(loaded.items()):
             parsed = reading.parse(content, reader, path, one_image=whole is None)
             if parsed is not None:
