@@ -189,7 +189,7 @@ def _read_keypoints(folder: Path) -> Any:
         within(0, 1, people[..., 2])
         within(-1, max(IMAGE_SIZE), people[..., :2])
     look = keypoint_files.preview_keypoints(folder, IMAGES, full_confidence=1.0)
-    return Notes(f"camera k1: {note}" for note in (*found.notes, *look))
+    return Notes(f"camera k1: {note}" for note in (*found.notes, *look.notes))
 
 
 def _person(count: int) -> np.ndarray:

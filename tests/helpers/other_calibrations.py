@@ -40,6 +40,30 @@ def write_pose2sim(folder: Path, views: Views) -> Path:
     return _write_toml(folder / "Calib_scene.toml", views, list(views), 4, 1.0, "fisheye = false\n")
 
 
+def write_qualisys(folder: Path, views: Views) -> Path:
+    """``Calib.qca.txt``: millimetres, 1/64 pixels, y up, and a camera that sees markers alone."""
+    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration>\n<cameras>\n"
+    text += '<camera model="Oqus 3+" serial="markers"/>\n'
+    for name, view in views.items():
+        axes = np.diag([1.0, -1.0, -1.0]) @ view.turn
+        x, y, z = -1000 * view.turn.T @ view.shift
+        rows = " ".join(f'r{i + 1}{j + 1}="{axes[i, j]:.17g}"' for i, j in np.ndindex(3, 3))
+        k = 64 * view.matrix
+        k1, k2, p1, p2 = view.distortion[:4]
+        text += (
+            f'<camera model="Miqus Video" serial="{name}">\n'
+            f'<fov_video left="8" top="4" right="{view.size[0] + 7}" bottom="{view.size[1] + 3}"/>'
+            f'<transform x="{x:.17g}" y="{y:.17g}" z="{z:.17g}" {rows}/>\n'
+            f'<intrinsic focalLengthU="{k[0, 0]}" focalLengthV="{k[1, 1]}" '
+            f'centerPointU="{k[0, 2] + 512}" centerPointV="{k[1, 2] + 256}" '
+            f'radialDistortion1="{k1}" radialDistortion2="{k2}" '
+            f'tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>\n</camera>\n'
+        )
+    path = folder / "Calib.qca.txt"
+    path.write_text(text + "</cameras>\n</calibration>\n")
+    return path
+
+
 def write_anipose(folder: Path, views: Views) -> Path:
     """``calibration.toml``: millimetres, five coefficients, tables cam_0, cam_1, ..."""
     tables = [f"cam_{number}" for number in range(len(views))]

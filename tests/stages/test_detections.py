@@ -137,8 +137,7 @@ NONE, ALL = [0, 0, 0, 0], [1, 1, 1, 1]
          "scaled to the image's size", ALL, ALL),
         ([*GOOD, result(7204)], "1 results in candidates/k1.json are of images that the recording "
          "does not have (first: 7204; it has images 0 to 3)", ALL, ALL),
-        ([result(image + 1) for image in range(SETS)], "image numbers count from 0", ALL,
-         [0, 1, 1, 1]),
+        ([result(image + 1) for image in range(SETS)], "are numbered from 1", ALL, ALL),
         ([], "", ALL, NONE),
     ],
 )  # fmt: skip

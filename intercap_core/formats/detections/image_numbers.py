@@ -105,6 +105,8 @@ class CameraImages:
             return {n: int(n) - self.first_number + first for n in given}, ""
         if self.recorded.issuperset(given):
             return {n: int(n) for n in given}, self.remark_on_start(given)
+        if first != 0 or len(self.recorded) <= max(self.recorded):
+            return None, ""  # the images have numbers of their own
         share = len(given) / len(self.recorded)
         if share >= MIN_SHARE_SHIFTED and self.recorded.issuperset(n - 1 for n in given):
             return {n: int(n) - 1 for n in given}, "numbered from 1"
@@ -259,7 +261,8 @@ def sort_by_image(
     by_id, remark_on_ids = images.match_numbers(ids)
     by_id = by_id or {}
     known_ids = images.recorded.intersection(by_id.get(n, n) for n in ids)
-    if len(known_ids) > len(images.recorded.intersection(by_name.values())):
+    known_names = images.recorded.intersection(by_name.values())
+    if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
         by_name = {}  # the numbers in the names are something else
     remark = remark if by_name else remark_on_ids or images.remark_on_start(ids)
 

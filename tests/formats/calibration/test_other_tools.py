@@ -45,6 +45,8 @@ Write = Callable[[Path], Path]
 FORMS: dict[str, tuple[Write, float | None]] = {
     "pose2sim": (lambda folder: written.write_pose2sim(folder, VIEWS), None),
     "pose2sim-folder": (lambda folder: written.write_pose2sim(folder, VIEWS).parent, None),
+    "qualisys": (lambda folder: written.write_qualisys(folder, VIEWS), None),
+    "qualisys-folder": (lambda folder: written.write_qualisys(folder, VIEWS).parent, None),
     "anipose": (lambda folder: written.write_anipose(folder, VIEWS), 0.001),
     "easymocap": (lambda folder: written.write_easymocap(folder, VIEWS), None),
     "easymocap-sizes": (lambda folder: written.write_easymocap(folder, VIEWS, sizes=True), None),
@@ -98,6 +100,33 @@ def test_pose2sim_by_hand(tmp_path):
     np.testing.assert_allclose(world @ [0.5, 2, 1.5, 1], [0.5, -0.5, 6, 1], atol=1e-12)
     seen = calibration.cameras["cam01"].colour.project((world @ [0.5, 2, 1.5, 1])[:3])
     np.testing.assert_allclose(seen, [544 + 1600 * 0.5 / 6, 960 - 1600 * 0.5 / 6], atol=1e-9)
+
+
+def test_qualisys_is_read_as_pose2sim_converts_it(tmp_path):
+    """Numbers of the first camera of Pose2Sim's demonstration, and its Calib_qualisys.toml."""
+    path = tmp_path / "Calib.qca.txt"
+    path.write_text(
+        '<calibration><cameras><camera model="none" serial="cam01">'
+        '<fov_video bottom="1919" left="0" right="1087" top="0"/>'
+        '<transform r11="0.5536380477336265" r12="0.8046719867383512" r13="0.2144479094331626" '
+        'r21="-0.4345300743838753" r22="0.05946489349975602" r23="0.8986921279821063" '
+        'r31="0.7104002579937896" r32="-0.5907342212870501" r33="0.3825762057979294" '
+        'x="1460.2323709212087" y="-1909.1590482454608" z="1896.5058524092062"/>'
+        '<intrinsic centerPointU="34110.316406" centerPointV="60680.792969" '
+        'focalLengthU="107599.671875" focalLengthV="107588.828125" radialDistortion1="-0.046183" '
+        'radialDistortion2="0.139983" tangentalDistortion1="0.000608" '
+        'tangentalDistortion2="0.00069"/></camera></cameras></calibration>'
+    )
+    calibration = read_calibration(path, RecordedCameras(("cam01",)))
+    world = calibration.extrinsics.master_from_world
+    rotation = Rotation.from_matrix(world[:3, :3]).as_rotvec()
+    np.testing.assert_allclose(rotation, [1.68827548, 1.04832205, -0.41955852], atol=1e-8)
+    np.testing.assert_allclose(world[:3, 3], [0.32110489, 0.95633206, 2.89071305], atol=1e-8)
+    lens = calibration.cameras["cam01"].colour
+    assert (lens.width, lens.height) == (1088, 1920)
+    expected = [1681.244873046875, 1681.075439453125, 532.97369384375, 948.137390140625]
+    np.testing.assert_allclose([lens.fx, lens.fy, lens.cx, lens.cy], expected)
+    np.testing.assert_allclose(lens.distortion[:4], [-0.046183, 0.139983, 0.000608, 0.00069])
 
 
 def test_nerfstudio_by_hand(tmp_path):
@@ -217,6 +246,10 @@ FAULTS = [
     ),
     ("pose2sim", edit('"front"', '"left"'), "two cameras are named 'left'"),
     ("pose2sim", edit("[left]", "[left"), "is not valid TOML"),
+    ("qualisys", edit("</cameras>", ""), "is no XML"),
+    ("qualisys", edit("<calibration>", "<!DOCTYPE a><calibration>"), "declares a document type"),
+    ("qualisys", edit('z="', 'height="'), "camera 'left': transform has"),
+    ("qualisys", edit('right="1287"', 'right="1287.5"'), "expected width and height"),
     ("pose2sim", edit("901.5", "nan"), "camera_matrix is .* expected finite numbers"),
     ("easymocap", remove("extri.yml"), "has no extri.yml"),
     ("easymocap", edit("K_front", "L_front", "intri.yml"), "camera 'front': has no K_front"),

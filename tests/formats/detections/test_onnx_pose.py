@@ -150,7 +150,9 @@ def test_body_models_are_used_and_other_layouts_refused(tmp_path, kind):
     image = tiny_pose.picture(SIZE, [LEFT])
     (body,) = model(tmp_path, kind, layout=BODY).find(image, [around(LEFT)])
     assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
-    with pytest.raises(UserError, match="has 21 keypoints, expected one of 17, 23, 25, 26, 133, 134"):
+    with pytest.raises(
+        UserError, match="has 21 keypoints, expected one of 17, 23, 25, 26, 133, 134"
+    ):
         model(tmp_path, kind, layout=tuple(tiny_pose.NAMES[:21]))
 
 
