@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -45,8 +46,9 @@ def write_qualisys(folder: Path, views: Views) -> Path:
     text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration>\n<cameras>\n"
     text += '<camera model="Oqus 3+" serial="markers"/>\n'
     for name, view in views.items():
-        axes = np.diag([1.0, -1.0, -1.0]) @ view.turn
-        x, y, z = -1000 * view.turn.T @ view.shift
+        turn = cv2.Rodrigues(view.turn)[0]
+        axes = np.diag([1.0, -1.0, -1.0]) @ turn
+        x, y, z = -1000 * turn.T @ view.shift.ravel()
         rows = " ".join(f'r{i + 1}{j + 1}="{axes[i, j]:.17g}"' for i, j in np.ndindex(3, 3))
         k = 64 * view.matrix
         k1, k2, p1, p2 = view.distortion[:4]
