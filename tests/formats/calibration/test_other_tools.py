@@ -246,13 +246,13 @@ FAULTS = [
     ),
     ("pose2sim", edit('"front"', '"left"'), "two cameras are named 'left'"),
     ("pose2sim", edit("[left]", "[left"), "is not valid TOML"),
-    ("qualisys", edit("</cameras>", "", "Calib.qca.txt"), "is no XML"),
+    ("qualisys", edit("</cameras>", ""), "is no XML"),
     (
         "qualisys",
         edit("<calibration>", "<!DOCTYPE a><calibration>", "Calib.qca.txt"),
         "declares a document type",
     ),
-    ("qualisys", edit('z="', 'height="', "Calib.qca.txt"), "camera 'left': transform has"),
+    ("qualisys", edit('z="', 'height="'), "camera 'left': transform has"),
     (
         "qualisys",
         edit('right="1287"', 'right="1287.5"', "Calib.qca.txt"),
