@@ -120,7 +120,11 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
         )
     findings.notes += _notes_on_keypoints(project, row, posed, findings)
     findings.notes += _notes_on_candidates(project, row, posed, findings)
-    told = [f"{kind}: {', '.join(sorted(texts))}" for kind, texts in findings.recognised.items()]
+    told = [
+        f"{kind}: {', '.join(sorted(texts))}"
+        for kind, texts in findings.recognised.items()
+        if texts
+    ]
     findings.summary = "; ".join([findings.summary, *told]) if findings.summary else ""
     return findings
 
