@@ -113,19 +113,15 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
             f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
             f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
         )
-    if len(posed) == 1:
-        findings.faults.append(
-            f"{row.recordings}: only camera {posed[0]} is used, expected at least 2, since points "
-            "are triangulated; add recordings and camera poses, or correct frames.cameras"
-        )
     findings.notes += _notes_on_keypoints(project, row, posed, findings)
     findings.notes += _notes_on_candidates(project, row, posed, findings)
-    told = [
-        f"{kind}: {', '.join(sorted(texts))}"
-        for kind, texts in findings.recognised.items()
-        if texts
-    ]
-    findings.summary = "; ".join([findings.summary, *told]) if findings.summary else ""
+    if findings.summary:
+        recognised = [
+            f"{kind}: {', '.join(sorted(texts))}"
+            for kind, texts in findings.recognised.items()
+            if texts
+        ]
+        findings.summary = "; ".join([findings.summary, *recognised])
     return findings
 
 
@@ -258,6 +254,11 @@ def check_recordings(
         _check_recording(findings, row, name, recording, expected.get(name))
         findings.images[name] = _images_of(name, recording, stems.get(name, ()))
     findings.summary = _summary(row, recordings)
+    if len(recordings) == 1 and not any(recording.depth for recording in recordings.values()):
+        findings.faults.append(
+            f"{row.recordings}: only camera {next(iter(recordings))} is used, and without depth; "
+            "add recordings and poses of other cameras (frames.cameras selects them), or depth"
+        )
     return findings
 
 

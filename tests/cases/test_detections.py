@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from pathlib import Path
 
 import cv2
@@ -13,16 +11,14 @@ import pytest
 from PIL import Image
 
 from intercap_core.body.keypoints import KEYPOINT_INDEX
-from intercap_core.commands.check_recordings import RecordingFindings, check_row
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.keypoints import layouts, read_people
 from intercap_core.formats.detections.mask_files import MaskFile, read_masks
-from intercap_core.project import Project, load_project
-from tests.conftest import PROJECT_ROOT
+from tests.cases import SEQUENCE, check, open_case
 
-SEQUENCE, SIZE = "s01_box", (320, 240)
+SIZE = (320, 240)
 # A standing person, by name: x, y.
 STANDING = {
     "nose": (160, 40), "neck": (160, 60), "mid_hip": (160, 120), "head": (160, 25),
@@ -37,23 +33,6 @@ STANDING = {
         ("thumb", 29, 124), ("foot", 18, 214),
     )
 }  # fmt: skip
-
-
-def open_case(name: str, folder: Path) -> Project:
-    """Copy a case to ``folder`` and open it; skips the test where the cases are not."""
-    cases = Path(os.environ.get("INTERCAP_CASES", PROJECT_ROOT.parent / "shared" / "cases"))
-    if not (cases / name).is_dir():
-        pytest.skip(f"{cases / name} is not here; set INTERCAP_CASES to the folder that holds it")
-    shutil.copytree(cases / name, folder / name, copy_function=shutil.copyfile)
-    for path in [folder / name, *(folder / name).rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
-    return load_project(folder / name / "config.yaml")
-
-
-def check(project: Project) -> RecordingFindings:
-    found = check_row(project, project.sequences[SEQUENCE])
-    assert not found.faults
-    return found
 
 
 def camera(count: int, stems: tuple[str, ...] = (), first: int | None = None) -> CameraImages:

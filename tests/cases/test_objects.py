@@ -14,7 +14,7 @@ import trimesh
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from tests.cases.test_detections import open_case
+from tests.cases import open_case
 
 
 def load(path: Path, **more) -> ObjectMesh:

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from intercap_core.commands.check_recordings import RecordingFindings, check_row
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.pipeline.step import run_step
-from intercap_core.project import Project, load_project
+from intercap_core.project import Project
 from intercap_core.scene.depth_scale import describe_depth_scale
 from intercap_core.scene.subject_views import find_subject_views
-from tests.conftest import PROJECT_ROOT
-
-SEQUENCE = "s01_box"
-
-
-def open_case(name: str, folder: Path) -> Project:
-    """Copy a case to ``folder`` and open it; skips the test where the cases are not."""
-    cases = Path(os.environ.get("INTERCAP_CASES", PROJECT_ROOT.parent / "shared" / "cases"))
-    if not (cases / name).is_dir():
-        pytest.skip(f"{cases / name} is not here; set INTERCAP_CASES to the folder that holds it")
-    shutil.copytree(cases / name, folder / name, copy_function=shutil.copyfile)
-    for path in [folder / name, *(folder / name).rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
-    return load_project(folder / name / "config.yaml")
-
-
-def check(project: Project) -> RecordingFindings:
-    return check_row(project, project.sequences[SEQUENCE])
+from tests.cases import SEQUENCE, check, open_case
 
 
 def frames_of(project: Project) -> Path:
@@ -69,7 +49,7 @@ def test_orientation_is_left_aside_with_a_calibration_of_colmap(tmp_path):
 def test_the_size_of_an_upright_video_is_that_as_shown(tmp_path):
     project = open_case("b03", tmp_path)
     found = check(project)
-    assert not found.faults and set(found.sizes.values()) == {(240, 320)}
+    assert not found.faults and {images.size for images in found.images.values()} == {(240, 320)}
 
 
 def test_depth_as_tiff_is_read(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.formats.recordings.layouts import open_layout
-from tests.cases.test_detections import SEQUENCE, check, open_case
+from tests.cases import SEQUENCE, check, open_case
 
 
 def test_frame_numbers_with_leading_zeros_are_decimal(tmp_path):
