@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.config import DetectionsSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
@@ -59,7 +60,7 @@ class RecordingFindings:
     """Faults that cost a camera or most of its images."""
     notes: list[str] = field(default_factory=list)
     """Smaller losses and probable mistakes."""
-    images: dict[str, CameraImages] = field(default_factory=dict)
+    images: dict[str, CameraImages] = field(default_factory=dict, compare=False)
     """Images of each camera whose recording could be opened; their number may be estimated."""
     recognised: dict[str, set[str]] = field(default_factory=dict)
     """What the content of keypoints and candidates tells about their form, by kind."""
@@ -67,6 +68,40 @@ class RecordingFindings:
     def add_recognised(self, kind: str, texts: Iterable[str]) -> None:
         """Add what was recognised in one camera's files."""
         self.recognised.setdefault(kind, set()).update(texts)
+
+    def compare_numbers(
+        self, kind: str, folder: Path, whole: Path | None, files: list[Path], images: CameraImages
+    ) -> None:
+        """Compare the images of one camera's detections with those of its recording.
+
+        Adds the numbering of a file of all images, and a note if there are more or fewer images.
+
+        Args:
+            kind: keypoints or candidates.
+            folder: folder of all cameras' detections.
+            whole: the file of all images, if there is one.
+            files: files of single images.
+            images: the camera's images.
+        """
+        recorded, count = len(images.recorded), len(files)
+        if whole is not None:
+            if whole.stat().st_size > 64 << 20:  # would take more than 0.5 s
+                return
+            content = whole.read_bytes()
+            ids, names = ({v.strip(b'"') for v in form.findall(content)} for form in _IMAGE_IDS)
+            count = len(ids or names)
+            _, remark = images.match_numbers({int(v) for v in ids if v.isdigit()})
+            self.add_recognised(kind, [f"images {remark}"] if remark else [])
+        if not recorded or not count:
+            return
+        cover = f"{folder}: {kind} of camera {images.name} cover {count}"
+        if count < MIN_IMAGE_SHARE * recorded:
+            self.notes.append(f"{cover} of its {recorded} images; run the detector on all of them")
+        elif count * MIN_IMAGE_SHARE > recorded:
+            self.notes.append(
+                f"{cover} images, it has {recorded}; they may belong to another recording, or the "
+                "recording is cut off"
+            )
 
 
 def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
@@ -104,7 +139,9 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
         if name not in known
     ]
     posed = [name for name in used if name in known]
-    findings = check_recordings(row, layout, posed, without_depth=not settings.depth)
+    findings = check_recordings(
+        row, layout, posed, without_depth=not settings.depth, settings=project.config.detections
+    )
     findings.faults[:0] = faults
     findings.notes[:0] = unread
     absent = [name for name in known if name not in layout.names]
@@ -162,8 +199,6 @@ def _notes_on_keypoints(
                 )
                 notes += preview.notes
                 findings.add_recognised("keypoints", preview.recognised)
-                whole, files = keypoint_files.keypoint_paths(folder, name)
-                notes += _compare_numbers(findings, "keypoints", folder, whole, files, images)
         elif settings.keypoint_model is None:
             notes.append(
                 f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
@@ -190,9 +225,6 @@ def _notes_on_candidates(
                 )
                 notes += preview.notes
                 findings.add_recognised("candidates", preview.recognised)
-                whole = candidate_files.camera_file(folder, name)
-                files = candidate_files.image_files(folder, name)
-                notes += _compare_numbers(findings, "candidates", folder, whole, files, images)
                 labels |= preview.labels
         elif settings.segmentation_model is None:
             notes.append(f"{folder} has no {name}.json; add this camera's candidates")
@@ -215,13 +247,23 @@ def list_labels(labels: list[str]) -> str:
 
 
 def check_recordings(
-    row: SequenceEntry, layout: RecordingLayout, cameras: Iterable[str], without_depth: bool = False
+    row: SequenceEntry,
+    layout: RecordingLayout,
+    cameras: Sequence[str],
+    *,
+    without_depth: bool = False,
+    settings: DetectionsSettings | None = None,
 ) -> RecordingFindings:
     """Open the recordings of ``cameras``, all of which have a camera pose, and check them.
 
     Args:
+        row: the sequence.
+        layout: its recordings.
+        cameras: names of the cameras.
         without_depth: the settings do not use depth.
+        settings: numbers of the first images in detections; None = recognised.
     """
+    settings = settings or DetectionsSettings()
     findings, recordings = RecordingFindings(), {}
     stems: dict[str, tuple[str, ...]] = {}
     for name in cameras:
@@ -252,11 +294,21 @@ def check_recordings(
     expected = _expected_seconds(recordings)
     for name, recording in recordings.items():
         _check_recording(findings, row, name, recording, expected.get(name))
-        findings.images[name] = _images_of(name, recording, stems.get(name, ()))
+        images = _images_of(name, recording, stems.get(name, ()))
+        findings.images[name] = images
+        if row.keypoints is not None:
+            whole, files = keypoint_files.keypoint_paths(row.keypoints, name)
+            images = replace(images, first_number=settings.keypoint_first_number)
+            findings.compare_numbers("keypoints", row.keypoints, whole, files, images)
+        if row.candidates is not None:
+            whole = candidate_files.camera_file(row.candidates, name)
+            files = candidate_files.image_files(row.candidates, name)
+            images = replace(images, first_number=settings.candidate_first_number)
+            findings.compare_numbers("candidates", row.candidates, whole, files, images)
     findings.summary = _summary(row, recordings)
-    if len(recordings) == 1 and not any(recording.depth for recording in recordings.values()):
+    if len(cameras) == len(recordings) == 1 and not recordings[cameras[0]].depth:
         findings.faults.append(
-            f"{row.recordings}: only camera {next(iter(recordings))} is used, and without depth; "
+            f"{row.recordings}: only camera {cameras[0]} is used, and without depth; "
             "add recordings and poses of other cameras (frames.cameras selects them), or depth"
         )
     return findings
@@ -338,50 +390,6 @@ def _images_of(name: str, recording: CheckedRecording, stems: tuple[str, ...]) -
     number = np.arange(len(stems) or recording.preview.images or 0)
     times = np.round(1e6 * number / recording.fps).astype(np.int64)
     return CameraImages(name, recording.size, number, times, frozenset(number.tolist()), stems)
-
-
-def _compare_numbers(
-    findings: RecordingFindings,
-    kind: str,
-    folder: Path,
-    whole: Path | None,
-    files: list[Path],
-    images: CameraImages,
-) -> list[str]:
-    """Notes on detections of one camera that are of more or fewer images than its recording's.
-
-    Adds the numbering of a file of all images to the findings.
-
-    Args:
-        findings: receives the numbering.
-        kind: keypoints or candidates.
-        folder: folder of all cameras' detections.
-        whole: the file of all images, if there is one.
-        files: files of single images.
-        images: the camera's images.
-    """
-    recorded, count = len(images.recorded), len(files)
-    if whole is not None:
-        if whole.stat().st_size > 64 << 20:  # would take more than 0.5 s
-            return []
-        content = whole.read_bytes()
-        ids, names = ({v.strip(b'"') for v in form.findall(content)} for form in _IMAGE_IDS)
-        count = len(ids or names)
-        _, remark = images.match_numbers({int(v) for v in ids if v.isdigit()})
-        findings.add_recognised(kind, [f"images {remark}"] if remark else [])
-    if not recorded or not count:
-        return []
-    if count < MIN_IMAGE_SHARE * recorded:
-        return [
-            f"{folder}: {kind} of camera {images.name} cover {count} of its {recorded} images; run "
-            "the detector on all of them"
-        ]
-    if count * MIN_IMAGE_SHARE > recorded:
-        return [
-            f"{folder}: {kind} of camera {images.name} cover {count} images, it has {recorded}; "
-            "they may belong to another recording, or the recording is cut off"
-        ]
-    return []
 
 
 def _summary(row: SequenceEntry, recordings: dict[str, CheckedRecording]) -> str:

@@ -38,11 +38,11 @@ from intercap_core.formats.detections.keypoints import (
     visible,
 )
 
-# Shares of compare_bones in 427 cameras of virtual recordings (annotated keypoints, MediaPipe, its
-# measured errors), by camera and by 20 images: up to 0.76 in body_25, up to 0.94 without neck and
-# middle of the hips. Right points in another layout: body_25b as body_25 0.75 to 1.35 (median 0.96),
-# kinect_v2 as body_25 0.69 to 1.22, h36m as coco 0.90 to 1.70; points in random order about 1.3.
-CERTAIN_BONE_SHARE = 0.8  # below it the layout is certain
+# Shares of compare_bones in 427 cameras of virtual recordings (true keypoints with errors, MediaPipe,
+# its measured errors): up to 0.72 in body_25, up to 0.94 without neck and middle of the hips. Right
+# points read in another layout: body_25b as body_25 0.75 to 1.35 (median 0.96), kinect_v2 as body_25
+# 0.69 to 1.22, h36m as coco 0.90 to 1.70. Points in random order: about 1.3.
+CERTAIN_BONE_SHARE = 0.75  # below it the layout is certain
 CERTAIN_WITHOUT_NECK = 0.95  # the same for layouts without neck and middle of the hips
 MAX_BONE_SHARE = 1.1  # above it points are not joined by bones
 MAX_SHARE_OF_OTHER = 0.75  # another layout is used if its share is smaller by this factor
@@ -250,8 +250,8 @@ def _recognise_layout(
         raise UserError(
             f"{folder}: the {count} keypoints of camera {reading.images.name} fit none of the "
             f"layouts {', '.join([assumed, *readings])}: in {assumed}, bones are {share:.2f} times "
-            "as long as the distance of two points, expected less than {MAX_BONE_SHARE:g}; name the layout in "
-            "detections.keypoint_layout, or write the keypoints in one of "
+            f"as long as the distance of two points, expected less than {MAX_BONE_SHARE:g}; name "
+            "the layout in detections.keypoint_layout, or write the keypoints in one of "
             f"{', '.join(sorted(layouts()))}"
         )
     reading.recognised.append(f"layout {assumed} (uncertain by its bones)")
