@@ -38,10 +38,10 @@ from intercap_core.formats.detections.keypoints import (
     visible,
 )
 
-# Shares of compare_bones in 427 cameras of virtual recordings (true keypoints with errors, MediaPipe,
-# its measured errors): up to 0.72 in body_25, up to 0.94 without neck and middle of the hips. Right
-# points read in another layout: body_25b as body_25 0.75 to 1.35 (median 0.96), kinect_v2 as body_25
-# 0.69 to 1.22, h36m as coco 0.90 to 1.70. Points in random order: about 1.3.
+# Shares of compare_bones in 427 cameras of virtual recordings (noise, MediaPipe, its errors): up to
+# 0.72 in body_25, up to 0.94 without neck and middle of the hips. Right points read in another
+# layout: body_25b as body_25 0.75 to 1.35 (median 0.96), kinect_v2 as body_25 0.69 to 1.22, h36m as
+# coco 0.90 to 1.70. Points in random order: about 1.3.
 CERTAIN_BONE_SHARE = 0.75  # below it the layout is certain
 CERTAIN_WITHOUT_NECK = 0.95  # the same for layouts without neck and middle of the hips
 MAX_BONE_SHARE = 1.1  # above it points are not joined by bones
