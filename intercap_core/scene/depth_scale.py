@@ -79,8 +79,8 @@ def describe_factor(ratios: np.ndarray) -> str:
     possible = [factor for factor in FACTORS if _share(ratios, factor) >= MIN_SHARE]
     if len(ratios) < MIN_POINTS or not possible:
         return (
-            f"the unit of its depth is not determined: {len(ratios)} body points have depth, too "
-            "few of them on the person"
+            f"the unit of its depth is not determined: {len(ratios)} triangulated body points have "
+            "depth, too few of them on the person"
         )
     if 1.0 in possible:
         return ""

@@ -131,6 +131,13 @@ def test_layouts_are_recognised_by_their_bones(tmp_path, layout, expected):
     np.testing.assert_array_equal(stated.by_image[1], found.by_image[1])
 
 
+def test_doubt_about_the_layout_is_noted_once(tmp_path):
+    moved = np.roll(np.reshape(person_of("halpe26"), (26, 3)), 5, axis=0)  # bones of 1.08
+    write_people(tmp_path, [f"{n}.json" for n in range(5)], moved.ravel().tolist())
+    notes = [note for note in read(tmp_path, camera(5)).notes if "taken for halpe26" in note]
+    assert len(notes) == 1
+
+
 def test_points_in_an_unknown_order_are_refused_unless_a_layout_is_stated(tmp_path):
     order = np.random.default_rng(1).permutation(26)
     shuffled = np.reshape(person_of("halpe26"), (26, 3))[order].ravel().tolist()
@@ -200,7 +207,7 @@ def test_keypoints_are_scaled_from_the_stated_size_or_from_shares(tmp_path):
     half, shares = (read(tmp_path / name, camera(1)) for name in ("half", "shares"))
     np.testing.assert_allclose(half.by_image[0][0, 0, :2], STANDING["nose"], atol=0.6)
     np.testing.assert_allclose(shares.by_image[0][0, 0, :2], STANDING["nose"], atol=1e-3)
-    assert "scaled from (160, 120) pixels" in half.recognised
+    assert "scaled from 160x120 pixels" in half.recognised
     with pytest.raises(UserError, match="240x320"):
         read(tmp_path / "other", camera(1))
 

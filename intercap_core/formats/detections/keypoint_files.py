@@ -172,9 +172,8 @@ class _Reading:
                 seen = (person[:, :2] != 0).any(1, keepdims=True)
                 person = np.column_stack([np.where(seen, scaled, 0), person[:, 2]])
                 content.scaled += 1
+                self.recognised.append(f"scaled from {key.size[0]}x{key.size[1]} pixels")
             content.results.append((key, person))
-        if content.scaled:
-            self.recognised.append(f"scaled from {content.results[0][0].size} pixels")
         return content
 
     @property
@@ -195,9 +194,10 @@ class _Reading:
         cleaner = KeypointCleaner(self.images.size, full_confidence)
         by_image = {number: cleaner.clean(people) for number, people in self.raw.items()}
         # A layout that fits is no news for the artefact; `check` reports it.
-        notes += [text for text in self.recognised if not text.startswith("layout ")]
+        recognised = list(dict.fromkeys(self.recognised))
+        notes += [text for text in recognised if not text.startswith("layout ")]
         notes += cleaner.notes()
-        return PeopleByImage(by_image, notes, list(dict.fromkeys(self.recognised)))
+        return PeopleByImage(by_image, notes, recognised)
 
     def _scale_shares(self) -> None:
         """Scale coordinates that are shares of the images' size if those of all people are."""
@@ -254,7 +254,10 @@ def _recognise_layout(
             "the layout in detections.keypoint_layout, or write the keypoints in one of "
             f"{', '.join(sorted(layouts()))}"
         )
-    reading.recognised.append(f"layout {assumed} (uncertain by its bones)")
+    reading.recognised.append(
+        f"{count} points are taken for {assumed}, but bones are {share:.2f} times as long as the "
+        "distance of two points; detections.keypoint_layout states another layout"
+    )
     return reading
 
 
