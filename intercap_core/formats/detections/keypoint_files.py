@@ -172,7 +172,8 @@ class _Reading:
                 seen = (person[:, :2] != 0).any(1, keepdims=True)
                 person = np.column_stack([np.where(seen, scaled, 0), person[:, 2]])
                 content.scaled += 1
-                self.recognised.append(f"scaled from {key.size[0]}x{key.size[1]} pixels")
+                own = "x".join(map(str, key.size or ()))
+                self.recognised.append(f"scaled from {own} pixels")
             content.results.append((key, person))
         return content
 
