@@ -29,7 +29,7 @@ _ARCHIVE_ERRORS = (
 )  # fmt: skip
 # Exceptions of the unpickler for damaged files.
 PICKLE_ERRORS = (
-    pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError,
+    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, EOFError,
     OverflowError, RecursionError, ImportError, AssertionError, SystemError,
     MemoryError,  # a damaged index of the unpickler's memo asks for any amount of memory
 )  # fmt: skip

@@ -244,6 +244,10 @@ class _Command:
         (pickle.dumps([_Command()]), "asks for posix.system"),
         (pickle.dumps(np.arange(9.0))[:-20], "not a pickle of numpy arrays"),
         (b"text", "not a pickle of numpy arrays"),
+        (
+            b"\x80\x02c_codecs\nencode\nX\x01\x00\x00\x00bX\x06\x00\x00\x00latin0\x86R.",
+            "unknown encoding",
+        ),
     ],
 )
 def test_pickles_of_other_objects_are_refused(content: bytes, words: str, tmp_path: Path) -> None:

@@ -207,12 +207,14 @@ class _Bytes:
 
     def take(self, form: str) -> tuple[Any, ...]:
         """Read the next values; ``form`` is a format of :mod:`struct` without byte order."""
-        end = self._at + struct.calcsize("<" + form)
-        if end > len(self._content):
+        return struct.unpack("<" + form, self.skip(struct.calcsize("<" + form)))
+
+    def skip(self, size: int) -> bytes:
+        """Read the next ``size`` bytes."""
+        first, self._at = self._at, self._at + size
+        if self._at > len(self._content):
             raise UserError(f"{self._path}: is cut off; copy or export it again")
-        values = struct.unpack("<" + form, self._content[self._at : end])
-        self._at = end
-        return values
+        return self._content[first : self._at]
 
     def name(self) -> str:
         """Read a text that ends with a zero byte."""
@@ -240,5 +242,5 @@ def _binary_images(content: _Bytes) -> Iterator[_Image]:
     for _ in range(content.take("Q")[0]):
         _, *values, camera = content.take("i7di")
         name = content.name()
-        content.take(f"{24 * content.take('Q')[0]}x")  # points: x, y and an identity, 8 bytes each
+        content.skip(24 * content.take("Q")[0])  # points: x, y and an identity, 8 bytes each
         yield _Image(tuple(values[:4]), tuple(values[4:]), camera, name)

@@ -209,6 +209,13 @@ def cut(file: str, count: int) -> Callable[[Path], None]:
     return lambda path: (path / file).write_bytes((path / file).read_bytes()[:count]) and None
 
 
+def endless_points(path: Path) -> None:
+    """A number of points, after the name of the first image, above all memory."""
+    images = path / "images.bin"
+    before, end, after = images.read_bytes().partition(b".png\0")
+    images.write_bytes(before + end + b"\xff" * 8 + after[8:])
+
+
 def exchange(one: str, other: str, file: str) -> Callable[[Path], object]:
     """Exchange two names everywhere in a file."""
 
@@ -276,6 +283,7 @@ FAULTS = [
     ("colmap-text", edit("left/frame", "left/", "images.txt"), None),
     ("colmap-text", twice, "left/frame_000001.png are 0.5 m and 0 degrees apart"),
     ("colmap-binary", cut("images.bin", 200), "images.bin: is cut off"),
+    ("colmap-binary", endless_points, "images.bin: is cut off"),
     ("nerfstudio", change(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' cannot be repres"),
     ("nerfstudio", change(is_fisheye=True), "is_fisheye cannot be represented"),
     ("nerfstudio", change(k4=0.01), "frame 1 .*: k4 is 0.01"),
