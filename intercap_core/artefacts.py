@@ -30,6 +30,8 @@ MADE_FROM = "made_from"  # attribute with the manifest of pipeline.provenance
 PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # one chunk fits into HDF5's default chunk cache
+_CHECKED_BYTES = 1 << 30  # a smaller dataset is read whatever it stores
+_MAX_RATIO = 1 << 16  # bytes unpacked per byte stored; Blosc2 packs a chunk of zeros into 32 bytes
 
 
 class Unreadable(UserError):
@@ -358,8 +360,10 @@ class Artefact:
         try:
             if key not in self._datasets:
                 self._datasets[key] = self._file[key]
+                self._check_size(key)
             values = self._datasets[key][selection]
-        except (OSError, RuntimeError, TypeError, AttributeError) as error:  # or it is a group
+        except (OSError, RuntimeError, TypeError, AttributeError, MemoryError) as error:
+            # damaged, or a group
             raise self._damaged(
                 f"dataset {key!r} is damaged (its checksum does not match)"
             ) from error
@@ -372,6 +376,7 @@ class Artefact:
     def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
         """Shape, type, units and frame of a dataset."""
         try:
+            self._check_size(key)
             dataset = self._file[key]
             return (
                 dataset.shape,
@@ -381,6 +386,13 @@ class Artefact:
             )
         except (OSError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             raise self._damaged(f"dataset {key!r} is damaged") from error
+
+    def _check_size(self, key: str) -> None:
+        """Raise Unreadable if a dataset declares more than its stored bytes can hold."""
+        if _declares_too_much(self._file[key]):
+            raise self._damaged(
+                f"dataset {key!r} has shape {self._file[key].shape}, but too few bytes"
+            )
 
     def _damaged(self, what: str) -> Unreadable:
         return Unreadable(
@@ -486,7 +498,18 @@ def _check_dataset(
         not text and dataset.dtype != np.dtype(declared.dtype)
     ):
         raise _Contradiction(f"dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}")
+    if _declares_too_much(dataset):
+        raise _Contradiction(f"dataset {key!r} has shape {dataset.shape}, but too few bytes")
     _check_shape(key, declared, dataset.shape, lengths)
+
+
+def _declares_too_much(dataset: h5py.Dataset) -> bool:
+    """Whether a dataset is larger than what its stored bytes can unpack to: most is a fill value.
+
+    Reading would take memory or time without a bound.
+    """
+    size = dataset.nbytes
+    return bool(size > _CHECKED_BYTES and size > _MAX_RATIO * dataset.id.get_storage_size())
 
 
 def pack_ragged(items: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -153,6 +154,19 @@ def put_instead(file: h5py.File, key: str, *, group: bool) -> None:
         file[key] = h5py.Empty("bool")
 
 
+def declare_rows(key: str, *shape: int) -> Callable[[Path], None]:
+    """Replace a dataset by a larger one, whose values are all the fill value."""
+
+    def apply(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            before = file[key]
+            kind, chunk = before.dtype, before.chunks
+            del file[key]
+            file.create_dataset(key, shape, kind, chunks=chunk)
+
+    return apply
+
+
 def replace_by_folder(path: Path) -> None:
     path.unlink()
     path.mkdir()
@@ -175,13 +189,15 @@ def replace_by_folder(path: Path) -> None:
         (edit(lambda file: file.attrs.__setitem__("schema_version", [3, 3])), "a whole number"),
         (edit(lambda file: file.attrs.__setitem__("schema", [1.0, 2.0])), "holds schema"),
         (edit(lambda file: file.attrs.__setitem__("complete", "no")), "never finished"),
+        (declare_rows("extra", 1 << 40), "dataset 'extra' has shape (1099511627776,), but too few"),
+        (declare_rows("cameras/k1/depth", 1 << 40, 6, 8), "(1099511627776, 6, 8), but too few"),
         (edit(lambda file: put_instead(file, "good", group=True)), "'good' holds no values"),
         (edit(lambda file: put_instead(file, "good", group=False)), "'good' holds no values"),
     ],
 )
 def test_broken_artefact_is_one_error_line(tmp_path: Path, damage, says: str) -> None:
     path = tmp_path / "trial.h5"
-    write_trial(path)
+    write_trial(path, extra=np.zeros(4, np.float32))
     damage(path)
     with pytest.raises(Unreadable) as raised, artefacts.read(path, SCHEMA) as source:
         for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)

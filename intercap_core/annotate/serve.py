@@ -45,7 +45,7 @@ def serve(
         import uvicorn
 
         from intercap_core.annotate.annotator import Annotator
-        from intercap_core.annotate.server import application
+        from intercap_core.annotate.server import Protocol, application
     except ModuleNotFoundError as error:
         raise UserError(
             f"the page needs the package {error.name}: pip install 'intercap-core[annotate]'"
@@ -58,6 +58,7 @@ def serve(
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind((HOST, port))
+            listening.listen()  # requests wait from now on, before the address is printed
         except OSError as error:
             raise UserError(
                 f"port {port} cannot be used ({error.strerror}); name another one by --port"
@@ -73,7 +74,7 @@ def serve(
             _show(address)
         options = uvicorn.Config(
             application(annotator, token), log_level="error", access_log=False,
-            server_header=False, timeout_graceful_shutdown=2, ws="none",
+            server_header=False, timeout_graceful_shutdown=2, ws="none", http=Protocol,
         )  # fmt: skip
         try:
             uvicorn.Server(options).run(sockets=[listening])

@@ -7,9 +7,11 @@ which other pages cannot set. Requests to another host or from another origin ar
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import secrets
+import time
 from collections.abc import Awaitable, Callable, MutableMapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from intercap_core.annotate import document, result, sides
 from intercap_core.annotate.annotator import Annotator
@@ -133,6 +136,7 @@ def _json(value: Any, status: int = 200) -> Response:
 TOKEN_HEADER = "x-intercap-token"
 HOSTS = ("127.0.0.1", "localhost", "::1")  # with any port, as a tunnel may use another
 MAX_BODY = 1 << 20  # bytes of a request
+MAX_WAITING = 64  # connections without a request; a browser has up to 6
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -206,9 +210,30 @@ def refusal(method: str, path: str, headers: dict[str, str], token: str) -> tupl
         if origin is None:
             return 403, "the request has no origin"
         length = headers.get("content-length", "")
-        if not length.isdigit() or int(length) > MAX_BODY:
+        if "transfer-encoding" in headers or not length.isdigit() or int(length) > MAX_BODY:
             return 413, f"a request may have at most {MAX_BODY} bytes"
     return None
+
+
+class Protocol(H11Protocol):
+    """HTTP/1.1 with a limit of the connections that have sent no complete request.
+
+    Above ``MAX_WAITING``, the oldest is closed, so that others on this machine cannot use up the
+    server's connections.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.opened = time.monotonic()
+        waiting = [other for other in self.connections if _is_waiting(other)]
+        if len(waiting) > MAX_WAITING:
+            oldest = min(waiting, key=lambda other: other.opened)
+            oldest.transport.abort()
+
+
+def _is_waiting(connection: Any) -> bool:
+    cycle = connection.cycle
+    return not connection.transport.is_closing() and (cycle is None or cycle.response_complete)
 
 
 async def _refuse(send: Send, status: int, reason: str) -> None:

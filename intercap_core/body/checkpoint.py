@@ -75,8 +75,12 @@ def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
 
     Raises UnreadableFile if the file is missing, too large or damaged, or contains no dictionary.
     """
-    check_file(path, MAX_MODEL_BYTES, advice=advice)
+    size = check_file(path, MAX_MODEL_BYTES, advice=advice)
     try:
+        unpacked = _unpacked_bytes(path)
+        if unpacked > size:  # torch.save does not compress
+            words = f"unpacks from {size / 1e6:.1f} MB to {unpacked / 1e6:.0f} MB, expected no more"
+            raise UnreadableFile(path, words, advice)
         read = _read(path)
     except _ERRORS as error:
         raise UnreadableFile(
@@ -114,6 +118,14 @@ def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str |
     if float(value.abs().max()) > largest:
         return f"weights up to {float(value.abs().max()):.3g}, expected at most {largest:g}"
     return None
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Size of the files in a checkpoint; 0 for the format before PyTorch 1.6, which is no zip."""
+    if not zipfile.is_zipfile(path):
+        return 0
+    with zipfile.ZipFile(path) as archive:
+        return sum(entry.file_size for entry in archive.infolist())
 
 
 def _read(path: Path) -> Any:

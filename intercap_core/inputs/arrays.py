@@ -16,6 +16,8 @@ import numpy as np
 from intercap_core.inputs.files import (
     MAX_ARRAYS_BYTES,
     MAX_PICKLE_BYTES,
+    MAX_UNPACKING,
+    MIN_UNPACKED_BYTES,
     UnreadableFile,
     printable,
     read_bytes,
@@ -55,8 +57,9 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz by name, all or those in ``wanted``.
 
-    Raises UnreadableFile if it is no archive, unpacks to more than ``limit`` bytes, or if a wanted
-    array is damaged or holds neither numbers nor text.
+    Raises UnreadableFile if it is no archive, unpacks to more than ``limit`` bytes or to more than
+    ``MAX_UNPACKING`` times its size, or if a wanted array is damaged or holds neither numbers nor
+    text.
     """
     content = read_bytes(path, limit, advice=advice)
     if content.startswith(b"\x93NUMPY"):
@@ -66,8 +69,12 @@ def read_arrays(
     except _ARCHIVE_ERRORS as error:
         raise UnreadableFile(path, f"is not a readable .npz archive ({error})", advice) from None
     unpacked = sum(entry.file_size for entry in archive.infolist())
+    limit = min(limit, max(MIN_UNPACKED_BYTES, MAX_UNPACKING * len(content)))
     if unpacked > limit:
-        words = f"unpacks to {unpacked / 1e6:.0f} MB, at most {limit / 1e6:.0f} are read"
+        size = f"{len(content) / 1e6:.1f} MB" if len(content) > 1e5 else f"{len(content)} bytes"
+        words = (
+            f"unpacks from {size} to {unpacked / 1e6:.0f} MB, at most {limit / 1e6:.0f} are read"
+        )
         raise UnreadableFile(path, words, advice)
     arrays = {}
     for entry in archive.infolist():

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import reprlib
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -20,6 +23,11 @@ MAX_MODEL_BYTES = 1 << 29  # COLMAP's images and their points; a mesh; network w
 MAX_IMAGE_BYTES = 1 << 28  # one image file
 MAX_PICKLE_BYTES = 1 << 28  # results of an hour at 30 frames a second
 MAX_ARRAYS_BYTES = 1 << 30  # arrays of an .npz unpacked; SMPL-X's have 350 MB
+MAX_UNPACKING = 100  # bytes unpacked per byte of an .npz; deflate reaches 1,032 for zeros
+MIN_UNPACKED_BYTES = 1 << 26  # up to this size, any ratio is accepted
+
+_REFERRING = {".obj", ".mtl", ".ply", ".glb", ".onnx"}  # suffixes of files that name other files
+_SEARCHED_BYTES = 1 << 26  # at the beginning of such a file; a graph without weights has less
 
 _FILE_TYPES = {
     stat.S_ISDIR: "a folder",
@@ -78,6 +86,34 @@ def check_file(path: Path, limit: int | None, *, advice: str = "check the path")
     if limit is not None and status.st_size > limit:
         raise UnreadableFile(path, _too_large(status.st_size, limit), advice)
     return status.st_size
+
+
+def referenced_files(path: Path) -> list[Path]:
+    """Files next to ``path``, or below, whose names its content holds, and those named in these.
+
+    Covers materials and textures of a mesh and external weights of an ONNX model without a parser
+    of each format. Includes pipes, devices and dangling links, which are not opened.
+    """
+    found = [path]
+    for file in found:  # which grows
+        if file.suffix.lower() in _REFERRING and file.is_file():
+            with contextlib.suppress(OSError), open(file, "rb") as opened:
+                content = opened.read(_SEARCHED_BYTES)
+                found += [
+                    named for named in _named_below(file.parent, content) if named not in found
+                ]
+    return found[1:]
+
+
+def _named_below(folder: Path, content: bytes) -> Iterator[Path]:
+    """Files below ``folder`` whose names, and those of the folders between, ``content`` holds."""
+    for entry in os.scandir(folder):
+        name, path = os.fsencode(entry.name), folder / entry.name
+        if name in content or quote(name).encode() in content:
+            if not entry.is_dir():
+                yield path
+            elif not folder.resolve().is_relative_to(path.resolve()):
+                yield from _named_below(path, content)
 
 
 def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:

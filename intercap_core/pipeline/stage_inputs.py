@@ -6,13 +6,11 @@ setting, table entry or annotation that its manifest does not record.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from pydantic import BaseModel
 
@@ -22,6 +20,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.formats.released import intercap_file
+from intercap_core.inputs.files import referenced_files
 from intercap_core.output.site.settings import changed
 from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.pipeline.code_digest import stage_code
@@ -32,8 +31,6 @@ from intercap_core.stage_list import STAGES
 from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
-_REFERRING = {".obj", ".mtl", ".ply", ".glb", ".onnx"}  # suffixes of files that name other files
-_SEARCHED_BYTES = 1 << 26  # at the beginning of such a file; a graph without weights has less
 
 
 def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
@@ -238,40 +235,17 @@ def _companion_files(path: Path) -> list[Path]:
     names = (f"{path.stem}.mtl", f"{path.stem}.png", f"{path.stem}.jpg", f"{path.stem}_maps.json")
     files = [file for name in names if (file := path.with_name(name)).is_file()]
     for file in (path, *files):
-        if file.suffix.lower() in _REFERRING and file.is_file():
+        if file.is_file():
             status = file.stat()
             stamp = (status.st_size, status.st_mtime_ns, path.parent.stat().st_mtime_ns)
-            files += _files_named_in(file, stamp)
+            files += _referenced(file, stamp)
     return sorted({file for file in files if file != path})
 
 
 @functools.cache
-def _files_named_in(path: Path, stamp: tuple[int, ...]) -> list[Path]:
-    """Files next to ``path``, or below, whose names its content holds, and those named in these.
-
-    Covers materials and textures of a mesh and external weights of an ONNX model without a parser
-    of each format. ``stamp`` is that of the file, for the cache.
-    """
-    found = [path]
-    for file in found:  # which grows
-        if file.suffix.lower() in _REFERRING:
-            with contextlib.suppress(OSError), open(file, "rb") as opened:
-                content = opened.read(_SEARCHED_BYTES)
-                found += [
-                    named for named in _named_below(file.parent, content) if named not in found
-                ]
-    return found[1:]
-
-
-def _named_below(folder: Path, content: bytes) -> Iterator[Path]:
-    """Files below ``folder`` whose names, and those of the folders between, ``content`` holds."""
-    for entry in os.scandir(folder):
-        name, path = os.fsencode(entry.name), folder / entry.name
-        if name in content or quote(name).encode() in content:
-            if entry.is_file():
-                yield path
-            elif entry.is_dir() and not folder.resolve().is_relative_to(path.resolve()):
-                yield from _named_below(path, content)
+def _referenced(path: Path, stamp: tuple[int, ...]) -> list[Path]:
+    """``referenced_files``, cached; ``stamp`` is that of the file."""
+    return referenced_files(path)
 
 
 def _body_files(config: Config, gender: str) -> BodyModels:

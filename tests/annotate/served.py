@@ -19,7 +19,7 @@ import h5py
 import uvicorn
 
 from intercap_core.annotate.annotator import Annotator
-from intercap_core.annotate.server import TOKEN_HEADER, application
+from intercap_core.annotate.server import TOKEN_HEADER, Protocol, application
 from intercap_core.person.sides import swap_sides
 from tests.helpers import fitted_capture as fitted
 
@@ -111,7 +111,9 @@ def served(settings: Path, **options: Any) -> Iterator[Served]:
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         server = uvicorn.Server(
-            uvicorn.Config(application(annotator, TOKEN), log_level="error", ws="none")
+            uvicorn.Config(
+                application(annotator, TOKEN), log_level="error", ws="none", http=Protocol
+            )
         )
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()

@@ -35,6 +35,7 @@ LIST, SAVE = ("GET", "/api/sequences"), ("POST", "/api/sequences/a/save")
         (SAVE, GET_HEADERS, 403),  # changes need an origin
         (LIST, {**GET_HEADERS, "sec-fetch-site": "cross-site"}, 403),
         (("POST", "/api/x"), {**POST_HEADERS, "content-length": str(MAX_BODY + 1)}, 413),
+        (SAVE, {**POST_HEADERS, "transfer-encoding": "chunked"}, 413),
         (("POST", "/"), POST_HEADERS, 405),
     ],
 )

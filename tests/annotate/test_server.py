@@ -7,6 +7,7 @@ import gzip
 import json
 import shlex
 import shutil
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import pytest
 import yaml
 
 from intercap_core.annotate import rerun
+from intercap_core.annotate.server import MAX_WAITING
 from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import unpacked
@@ -45,6 +47,24 @@ def test_the_list_and_a_sequence_are_served(still: Served) -> None:
     assert answer["frames"] == 6 and answer["object"] == "football" and answer["viewer"]
     assert [entry["name"] for entry in answer["cameras"]] == ["k1", "k2", "k3"]
     assert answer["annotation"]["digest"] == "none"
+
+
+def test_connections_without_a_request_shut_nobody_out(still: Served) -> None:
+    waiting = [socket.create_connection(("127.0.0.1", still.port)) for _ in range(300)]
+    for connection in waiting[:200]:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+    assert still.get("/")[0] == 200
+    open_ = 0
+    for connection in waiting:
+        connection.settimeout(0.0)
+        try:
+            connection.recv(1)
+        except BlockingIOError:
+            open_ += 1
+        except ConnectionResetError:
+            pass
+        connection.close()
+    assert open_ <= MAX_WAITING
 
 
 def test_images_come_as_large_as_they_are_shown(still: Served) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -176,6 +177,21 @@ def test_checkpoints_without_a_decoder_are_reported(name: str, tmp_path: Path) -
     with pytest.raises(UserError, match=words) as caught:
         VPoser.load(path)
     assert str(path) in str(caught.value)
+
+
+def test_packed_weights_are_refused_unread(tmp_path: Path) -> None:
+    """torch.save does not compress; zeros unpack to a thousand times their size."""
+    path = _save(tmp_path, 1)
+    packed = tmp_path / "packed.pt"
+    with (
+        zipfile.ZipFile(path) as stored,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        for name in stored.namelist():
+            content = stored.read(name)
+            archive.writestr(name, bytes(len(content)) if "/data/" in name else content)
+    with pytest.raises(UserError, match=r"packed\.pt unpacks from 0\.0 MB to 1 MB"):
+        VPoser.load(packed)
 
 
 def test_missing_and_damaged_files_are_reported(tmp_path: Path) -> None:

@@ -201,9 +201,17 @@ def test_arrays_with_a_wrong_head_are_refused(content: bytes, words: str, tmp_pa
 def test_the_unpacked_size_of_an_archive_is_limited(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, zeros=np.zeros(1 << 20))
-    with pytest.raises(UnreadableFile, match="unpacks to 8 MB, at most 1"):
+    with pytest.raises(UnreadableFile, match="to 8 MB, at most 1"):
         read_arrays(path, limit=1 << 20)
     assert read_arrays(path)["zeros"].shape == (1 << 20,)
+
+
+def test_an_archive_unpacks_to_at_most_a_hundred_times_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("values.npy", _head("(10000000,)") + bytes(80_000_000))
+    with pytest.raises(UnreadableFile, match=r"unpacks from .* bytes to 80 MB, at most 67"):
+        read_arrays(path)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])

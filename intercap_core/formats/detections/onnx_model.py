@@ -16,7 +16,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import parse_class_names
-from intercap_core.inputs.files import check_file, printable
+from intercap_core.inputs.files import check_file, printable, referenced_files
 
 FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
 # Mean of ImageNet, blue first, as in Caffe's models; maskrcnn-benchmark subtracts it.
@@ -113,6 +113,9 @@ class OnnxModel:
             raise _no_device(path, device, onnxruntime)
         try:
             check_file(path, 1 << 31)  # limit of the format; larger models store weights elsewhere
+            for weights in referenced_files(path):
+                if weights.exists():
+                    check_file(weights, None, advice=f"export {path.name} again")
             session = onnxruntime.InferenceSession(str(path), options, providers=[wanted])
         except _runtime_errors() as error:
             raise UserError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import json
+import os
 
 import cv2
 import numpy as np
@@ -207,12 +208,12 @@ def huge_input(*shape):
     return change
 
 
-def external_data(model):
+def external_data(model, location="/dev/zero"):
     constant = model.graph.initializer[0]
     constant.data_location = onnx.TensorProto.EXTERNAL
     length = len(constant.raw_data)
     constant.ClearField("raw_data")
-    for key, value in (("location", "/dev/zero"), ("offset", "0"), ("length", str(length))):
+    for key, value in (("location", location), ("offset", "0"), ("length", str(length))):
         constant.external_data.add(key=key, value=value)
 
 
@@ -230,6 +231,20 @@ def test_models_that_would_fill_the_memory_are_refused(tmp_path, change):
     path.write_bytes(model.SerializeToString())
     with pytest.raises(UserError, match=r"model\.onnx"):
         found(DetectionsSettings(segmentation_model=path), [picture()[0]])
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "pipe"])
+def test_weights_outside_the_file_are_files(tmp_path, target):
+    path = tiny_onnx.yolo(tmp_path / "model.onnx", (160, 160), NAMES)
+    model = onnx.load(path)
+    external_data(model, "weights.bin")
+    path.write_bytes(model.SerializeToString())
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "weights.bin").symlink_to(target)
+    with pytest.raises(
+        UserError, match=r"weights\.bin: cannot be read .it is a .*export model.onnx"
+    ):
+        OnnxModel.load(path)
 
 
 def test_a_missing_device_is_refused(tmp_path):
