@@ -225,15 +225,15 @@ class Protocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.opened = time.monotonic()
-        waiting = [other for other in self.connections if _is_waiting(other)]
+        others = [other for other in self.connections if isinstance(other, Protocol)]
+        waiting = [other for other in others if other.is_waiting()]
         if len(waiting) > MAX_WAITING:
-            oldest = min(waiting, key=lambda other: other.opened)
-            oldest.transport.abort()
+            min(waiting, key=lambda other: other.opened).transport.abort()
 
-
-def _is_waiting(connection: Any) -> bool:
-    cycle = connection.cycle
-    return not connection.transport.is_closing() and (cycle is None or cycle.response_complete)
+    def is_waiting(self) -> bool:
+        """Whether the connection is open and has no request that is being answered."""
+        answered = self.cycle is None or self.cycle.response_complete
+        return answered and not self.transport.is_closing()
 
 
 async def _refuse(send: Send, status: int, reason: str) -> None:

@@ -99,21 +99,24 @@ def referenced_files(path: Path) -> list[Path]:
         if file.suffix.lower() in _REFERRING and file.is_file():
             with contextlib.suppress(OSError), open(file, "rb") as opened:
                 content = opened.read(_SEARCHED_BYTES)
-                found += [
-                    named for named in _named_below(file.parent, content) if named not in found
-                ]
+                named = _named_below(file.parent, content, ())
+                found += [other for other in named if other not in found]
     return found[1:]
 
 
-def _named_below(folder: Path, content: bytes) -> Iterator[Path]:
-    """Files below ``folder`` whose names, and those of the folders between, ``content`` holds."""
+def _named_below(folder: Path, content: bytes, above: tuple[Path, ...]) -> Iterator[Path]:
+    """Files below ``folder`` whose names, and those of the folders between, ``content`` holds.
+
+    ``above``: resolved folders above, to which a link may lead back.
+    """
+    above = (*above, folder.resolve())
     for entry in os.scandir(folder):
         name, path = os.fsencode(entry.name), folder / entry.name
         if name in content or quote(name).encode() in content:
             if not entry.is_dir():
                 yield path
-            elif not folder.resolve().is_relative_to(path.resolve()):
-                yield from _named_below(path, content)
+            elif path.resolve() not in above:
+                yield from _named_below(path, content, above)
 
 
 def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:

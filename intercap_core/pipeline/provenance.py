@@ -251,7 +251,7 @@ def _changed_files(
         for name in sorted({*old, *new}):
             if name not in old:
                 reasons.append(f"{_label(role)}: {name} is new")
-            elif name not in new or new[name] == "missing":
+            elif name not in new or new[name] == "missing" != old[name]:
                 reasons.append(f"{_label(role)}: {name} is gone")
             elif old[name] != new[name]:
                 reasons.append(f"{_label(role)}: {name} has another content")

@@ -447,9 +447,10 @@ def test_files_of_equal_names_in_folders_behind_links_count(folder: Path) -> Non
     for name in ("inner", "outer"):
         (outside / name).mkdir(parents=True)
         (outside / name / "map.png").write_text("red")
-    (outside / "outer" / "inner").symlink_to(mesh.parent)  # back, without an end
+    (outside / "outer" / "inner").symlink_to(mesh.parent.resolve())  # back, without an end
     (mesh.parent / "inner").symlink_to(outside / "inner")
     (mesh.parent / "outer").symlink_to(outside / "outer")
+    (mesh.parent / "comment").symlink_to("nowhere")  # dangling before and after
     with mesh.open("ab") as file:
         file.write(b"comment TextureFile inner/map.png\ncomment TextureFile outer/map.png\n")
     _bring_up_to_date(load_project(SETTINGS))
