@@ -13,10 +13,11 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
 from intercap_core.evaluation import body, contact, object_errors, scene_errors
 from intercap_core.evaluation import truth as truths
-from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.project import Project
 from intercap_core.schemas import METRIC_REGIONS, PERSON, SCENE
 
@@ -157,11 +158,16 @@ def _joint(written: Sequence[Written]) -> Figures:
         shift.append(errors["object_translation"])
         turn.append(errors["object_rotation"])
         surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+        faces = fitted.model.faces.numpy()
+        tree = SurfaceTree(fitted.model.template.numpy(), faces)
         touched = np.stack(
             [
                 contact.vertex_contact(
-                    surface.signed_distance(
-                        vertices.astype(np.float64), track.rotation[t], track.translation[t]
+                    surface.contact_distance(
+                        BodySurface(vertices.astype(np.float64), faces, tree),
+                        track.rotation[t],
+                        track.translation[t],
+                        1.01 * contact.CONTACT_M,
                     )
                 )
                 for t, vertices in enumerate(fitted.vertices())

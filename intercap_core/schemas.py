@@ -476,7 +476,7 @@ _PER_STAGE_TRUTH = {
 # Object and contact datasets are absent in recordings without an object.
 METRICS = Schema(
     name="metrics",
-    version=4,
+    version=5,
     stage="metrics",
     attributes={
         "sequence": "sequence name",
@@ -491,11 +491,13 @@ METRICS = Schema(
     fields={
         "body_to_object": Field(("T", "V"), "float32", "signed distance of each body vertex to the object's surface, negative inside, capped at 0.10, inside at -0.25", "m", optional=True),
         "object_sample_points": Field(("N", "3"), "float64", "points distributed evenly over the object's surface", "m", "object", optional=True),
-        "object_sample_contact": Field(("N",), "int32", "number of frames in which the point is within 4.5 mm of the body", optional=True),
+        "object_sample_contact": Field(("N",), "int32", "number of frames in which the point faces the body within 4.5 mm", optional=True),
         "object_to_body": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the body's surface, negative inside, capped at 0.10, inside at -0.25", "m", optional=True),
-        "contact_frame": Field(("T",), "bool", "a body vertex within 4.5 mm of the object", optional=True),
+        "body_contact_distance": Field(("T", "V"), "float32", "signed distance of each body vertex to the part of the object's surface that it faces with nothing between, negative inside; 0.10 = faces none within 30 mm", "m", optional=True),
+        "object_contact_distance": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the part of the body's surface that it faces with nothing between, negative inside; 0.10 = faces none within 4.5 mm", "m", optional=True),
+        "contact_frame": Field(("T",), "bool", "a body vertex with a contact distance of at most 4.5 mm", optional=True),
         "region_names": Field(("R",), "str", "contact regions", optional=True),
-        "region_contact": Field(("T", "R"), "bool", "the region has a vertex within 4.5 mm", optional=True),
+        "region_contact": Field(("T", "R"), "bool", "the region has a vertex with a contact distance of at most 4.5 mm", optional=True),
         "contact_probability": Field(("T", "R"), "float32", "contact probability of the joint stage", optional=True),
         "penetration_mean": Field(("T",), "float32", "mean depth of body vertices inside the object; 0 = none", "m", optional=True),
         "penetration_median": Field(("T",), "float32", "median depth of body vertices inside the object", "m", optional=True),
@@ -551,7 +553,9 @@ METRICS = Schema(
     },
 )  # fmt: skip
 
-PER_VERTEX_METRICS = frozenset({"body_to_object", "object_to_body"})
+PER_VERTEX_METRICS = frozenset(
+    {"body_to_object", "object_to_body", "body_contact_distance", "object_contact_distance"}
+)
 
 # Input of the dataset's statistics: the metrics without distances by vertex.
 SUMMARY = Schema(
@@ -570,7 +574,7 @@ SUMMARY = Schema(
     optional_attributes=METRICS.optional_attributes,
     fields={
         **{key: declared for key, declared in METRICS.fields.items() if key not in PER_VERTEX_METRICS},
-        "body_contact_frames": Field(("V",), "int32", "number of frames in which the body vertex is within 4.5 mm of the object", optional=True),
+        "body_contact_frames": Field(("V",), "int32", "number of frames in which the body vertex faces the object within 4.5 mm", optional=True),
         "rig/camera_names": Field(("Cr",), "str", "camera names"),
         "rig/images": Field(("Cr",), "int32", "number of frames with a colour image"),
         "rig/time_offset": Field(("Cr",), "float64", "exposure time minus the master's", "s"),

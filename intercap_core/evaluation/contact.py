@@ -1,8 +1,10 @@
 """Contact by distance, depths of penetration, and agreement of contact with the true contact.
 
-A vertex is in contact if its signed distance to the other surface is at most the threshold. The
-distance is negative inside, so a penetrating vertex is in contact too. The paper thresholds the
-unsigned distance at 4.5 mm; the two differ for vertices that are more than 4.5 mm inside.
+A vertex is in contact if its signed distance to the part of the other surface that it faces
+(:mod:`intercap_core.geometry.rigid.facing`) is at most the threshold. The distance is negative
+inside, so a penetrating vertex is in contact too. The paper thresholds the unsigned distance to the
+whole surface at 4.5 mm; so vertices behind a thin wall count there, and those more than 4.5 mm
+inside do not.
 """
 
 from __future__ import annotations
@@ -17,9 +19,17 @@ CONTACT_M = 0.0045  # the paper's threshold, Experiments, "Contact Heatmaps"
 SWEEP_M = (0.002, 0.003, 0.0045, 0.006, 0.008, 0.010, 0.015, 0.020, 0.030)
 
 
-def vertex_contact(signed_distance: np.ndarray, threshold_m: float = CONTACT_M) -> np.ndarray:
-    """Mask of the vertices in contact, of the shape of ``signed_distance`` (metres)."""
-    return signed_distance <= threshold_m
+def facing_reach(threshold_m: float) -> float:
+    """Distance up to which contact is evaluated at ``threshold_m`` and in the sweep, metres."""
+    return 1.01 * max(threshold_m, *SWEEP_M)
+
+
+def vertex_contact(facing_distance: np.ndarray, threshold_m: float = CONTACT_M) -> np.ndarray:
+    """Mask of the vertices in contact, of the shape of ``facing_distance`` (metres).
+
+    The distances are those of :func:`intercap_core.geometry.rigid.facing.facing_distance`.
+    """
+    return facing_distance <= threshold_m
 
 
 def region_contact(

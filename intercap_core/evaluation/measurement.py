@@ -14,6 +14,7 @@ import numpy as np
 
 from intercap_core.evaluation import contact
 from intercap_core.evaluation.proximity import (
+    REACH_M,
     BodySurface,
     MeasuredCloud,
     PosedObject,
@@ -25,9 +26,10 @@ from intercap_core.evaluation.segmented import SegmentedClouds
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.rigid.facing import facing_distance
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.surface_tree import SurfaceTree
-from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
+from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
+from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface, vertex_normals
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -54,7 +56,15 @@ class HandledObject:
         ).sum()
         # ``area`` is twice the surface; 500 to 20000 samples
         count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, 20000))
-        self.points = sample_surface(mesh.vertices, mesh.faces, count).of(mesh.vertices, mesh.faces)
+        contact_samples = sample_surface(mesh.vertices, mesh.faces, count)
+        self.points = contact_samples.of(mesh.vertices, mesh.faces)
+        # of the points, then of the vertices; an open surface is touched from both sides
+        self.normals = float(mesh.watertight) * np.concatenate(
+            [
+                mesh.face_normals[contact_samples.faces],
+                vertex_normals(mesh.vertices, mesh.faces),
+            ]
+        )
         self.samples = sample_surface(mesh.vertices, mesh.faces, 2000)
         self.sample_points = self.samples.of(mesh.vertices, mesh.faces)
         self.sample_normals = mesh.face_normals[self.samples.faces]
@@ -62,6 +72,10 @@ class HandledObject:
     def posed(self, t: int, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) of the object, object frame, in the master frame at frame ``t``."""
         return points @ self.track.rotation[t].T + self.track.translation[t]
+
+    def placed(self, t: int) -> ShapedSurface:
+        """The object's surface in the master frame at frame ``t``."""
+        return self.surface.placed(self.track.rotation[t], self.track.translation[t])
 
 
 class Measurement:
@@ -92,7 +106,7 @@ class Measurement:
         """Values by dataset of the metrics artefact.
 
         With truth, also ``true_distance`` (T, V): signed distances of the true body's vertices from
-        the true object.
+        the true object, and ``true_facing`` (T, V): their contact distances.
 
         Args:
             floor: point (3,) and unit normal (3,) of the floor; NaN = unknown.
@@ -110,16 +124,19 @@ class Measurement:
         for t, vertices in enumerate(self.body.vertices()):
             vertices = vertices.astype(np.float64)
             row: Values = {"ground_penetration": contact.ground_penetration(vertices, *floor)}
-            surface = BodySurface(vertices, self.faces, self.tree)
+            surface, placed = BodySurface(vertices, self.faces, self.tree), None
             if handled is not None:
-                between, touched = self._between(handled, t, vertices, surface, floor)
+                placed = handled.placed(t)
+                between, touched = self._between(handled, t, vertices, surface, placed, floor)
                 row |= between
                 counts += touched
             seen_body = seen_object = None
             if truth is not None and truth.visible is not None:
                 share = self.body_samples.of(truth.visible[t].astype(np.float32), self.faces)
                 seen_body, seen_object = share > 0.5, None if seen is None else seen[t]
-            cloud_row, clouds = self._to_clouds(t, vertices, surface, seen_body, seen_object)
+            cloud_row, clouds = self._to_clouds(
+                t, vertices, surface, placed, seen_body, seen_object
+            )
             row |= cloud_row
             if truth is not None:
                 row |= self._true_body(t, truth, clouds[0], seen_body)
@@ -132,7 +149,7 @@ class Measurement:
         values = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
         if handled is None:
             return values
-        touching = contact.vertex_contact(values["body_to_object"], self.threshold)
+        touching = contact.vertex_contact(values["body_contact_distance"], self.threshold)
         return values | {
             "object_sample_points": handled.points,
             "object_sample_contact": counts,
@@ -149,6 +166,7 @@ class Measurement:
         t: int,
         vertices: np.ndarray,
         surface: BodySurface,
+        placed: ShapedSurface,
         floor: tuple[np.ndarray, np.ndarray],
     ) -> tuple[Values, np.ndarray]:
         """Distances between body and object in frame ``t``.
@@ -159,16 +177,32 @@ class Measurement:
         points = handled.posed(t, handled.points)
         to_body = surface.signed_distance(object_vertices)
         # outside the body only contact is evaluated, so distances may be clipped beyond the
-        # threshold
-        point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
+        # thresholds
+        reach = 1.01 * max(self.threshold, contact.CONTACT_M)
+        point_distance = surface.signed_distance(points, reach=reach)
         track = handled.track
         to_object = handled.surface.signed_distance(
             vertices, track.rotation[t], track.translation[t]
+        )
+        of_points, of_vertices = np.split(
+            facing_distance(
+                np.concatenate([points, object_vertices]),
+                handled.normals @ track.rotation[t].T,
+                np.concatenate([point_distance, to_body]),
+                own=placed,
+                other=surface.surface,
+                reach=reach,
+            ),
+            [len(points)],
         )
         depth = contact.depths(to_object)
         return {
             "body_to_object": to_object,
             "object_to_body": to_body,
+            "body_contact_distance": surface.facing(
+                placed, to_object, contact.facing_reach(self.threshold)
+            ),
+            "object_contact_distance": np.minimum(of_vertices, REACH_M),
             "penetration_mean": depth.mean,
             "penetration_median": depth.median,
             "penetration_max": depth.max,
@@ -177,18 +211,20 @@ class Measurement:
                 contact.ground_penetration(vertices, *floor),
                 contact.ground_penetration(object_vertices, *floor),
             ),
-        }, contact.vertex_contact(point_distance, self.threshold)
+        }, contact.vertex_contact(of_points, self.threshold)
 
     def _to_clouds(
         self,
         t: int,
         vertices: np.ndarray,
         surface: BodySurface,
+        placed: ShapedSurface | None,
         seen_body: np.ndarray | None,
         seen_object: np.ndarray | None,
     ) -> tuple[Values, tuple[MeasuredCloud, MeasuredCloud]]:
         """Distances to the clouds of frame ``t``, and the clouds of person and object.
 
+        ``placed``: surface of the object in this frame; None without an object.
         ``seen_body``, ``seen_object``: masks of the visible surface samples, from the truth; None =
         computed from the fitted meshes.
         """
@@ -201,10 +237,7 @@ class Measurement:
             MeasuredCloud(points) for points in self.clouds.at(t, np.concatenate(near))
         )
         body_points = self.body_samples.of(vertices, self.faces)
-        occluders = [surface.surface]
-        if handled is not None and (seen_body is None or seen_object is None):
-            track = handled.track
-            occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
+        occluders = [surface.surface] if placed is None else [surface.surface, placed]
         if seen_body is None:
             normals = face_normals(vertices, self.faces)[self.body_samples.faces]
             seen_body = seen_by_cameras(body_points, normals, self.rig.cameras, occluders)
@@ -257,7 +290,11 @@ class Measurement:
         if truth.vertices is not None:
             vertices = truth.vertices[t].astype(np.float64)
             distance = surface.signed_distance(vertices, rotation, translation)
+            facing = BodySurface(vertices, self.faces, self.tree).facing(
+                surface.placed(rotation, translation), distance, contact.facing_reach(self.threshold)
+            )
             row["true_distance"] = distance.astype(np.float32)
+            row["true_facing"] = facing.astype(np.float32)
             row["truth/penetration_mean"] = contact.depths(distance).mean
-            row["truth/contact_frame"] = contact.vertex_contact(distance, self.threshold).any()
+            row["truth/contact_frame"] = contact.vertex_contact(facing, self.threshold).any()
         return row

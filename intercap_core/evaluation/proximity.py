@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.facing import facing_distance
 from intercap_core.geometry.rigid.point_grid import PointGrid
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 
 class MeasuredCloud:
@@ -81,12 +84,21 @@ class PosedObject:
         """
         return self._solid.signed_distance((points - translation) @ rotation, reach)
 
+    def contact_distance(
+        self, body: BodySurface, rotation: np.ndarray, translation: np.ndarray, reach: float
+    ) -> np.ndarray:
+        """Contact distances (V,) of a body's vertices to the object, see
+        :meth:`BodySurface.facing`."""
+        signed = self.signed_distance(body.vertices, rotation, translation, reach=reach)
+        return body.facing(self.placed(rotation, translation), signed, reach)
+
 
 class BodySurface:
     """The surface of a body in one pose, vertices (V, 3), with the search ``tree`` of its faces."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
         self.surface = tree.shaped(vertices)
+        self.vertices, self._faces = vertices, faces
         self._solid = _Solid(self.surface, None if tree.closed else DistanceField(vertices, faces))
 
     def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
@@ -96,6 +108,20 @@ class BodySurface:
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Unsigned distance (N,) of points (N, 3), at most ``DEEPEST_M``."""
         return self.surface.distance(points, DEEPEST_M)
+
+    @cached_property
+    def _normals(self) -> np.ndarray:
+        return vertex_normals(self.vertices, self._faces)
+
+    def facing(self, object_: ShapedSurface, signed: np.ndarray, reach: float) -> np.ndarray:
+        """Contact distances (V,) of the body's vertices to an object, by ``signed`` (V,) distances.
+
+        See :func:`.facing_distance`; capped at ``REACH_M``, which stands for none within ``reach``.
+        """
+        distance = facing_distance(
+            self.vertices, self._normals, signed, self.surface, object_, reach
+        )
+        return np.minimum(distance, REACH_M)
 
 
 class _Solid:

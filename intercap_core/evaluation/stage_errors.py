@@ -14,11 +14,12 @@ from intercap_core.evaluation import body, contact, motion, object_pose
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.measurement import Values
 from intercap_core.evaluation.motion import foot_errors, slip_speed, support
-from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import METRIC_REGIONS
 
 _FEET = ("left_foot", "right_foot")  # regions of the soles
@@ -40,20 +41,22 @@ class StageErrors:
     """Errors of each stage by dataset name; quantities that a stage does not estimate are omitted.
 
     If ``mesh`` (of the tracked object) is None or there is no true object, only the body is
-    evaluated. ``true_distance``: (T, V) signed distances of the true body from the true object.
+    evaluated. ``true_distance``, ``true_facing``: (T, V) signed and contact distances of the true
+    body from the true object.
     """
 
     def __init__(
         self,
         truth: truths.Truth,
         true_distance: np.ndarray | None,
+        true_facing: np.ndarray | None,
         mesh: ObjectMesh | None,
         threshold_m: float,
         fps: float,
     ) -> None:
         self._truth = truth
-        self._true_distance = true_distance
-        self._threshold = threshold_m
+        self._true_distance, self._true_facing = true_distance, true_facing
+        self._threshold, self._reach = threshold_m, contact.facing_reach(threshold_m)
         self._fps = fps
         self._object: _ObjectSurfaces | None = None
         if mesh is not None and truth.has_object:
@@ -64,8 +67,8 @@ class StageErrors:
             )
         self._touched = np.zeros(0, int)  # vertices in true contact in at least one frame
         self._true_local = np.zeros((0, 0, 3))  # (T, N, 3) of these vertices, true object's frame
-        if truth.vertices is not None and true_distance is not None:
-            touching = contact.vertex_contact(true_distance)
+        if truth.vertices is not None and true_facing is not None:
+            touching = contact.vertex_contact(true_facing)
             self._touched = np.flatnonzero(touching.any(0))
             self._true_local = _local(
                 truth.vertices[:, self._touched], truth.rotation, truth.translation
@@ -92,7 +95,7 @@ class StageErrors:
             stage: "body_fit" or "joint".
             body_track: bodies after the stage.
             track: the object's poses; for ``body_fit`` those of ``object_track``.
-            distance: (T, V) signed distances of the vertices from the object; None = compute.
+            distance: (T, V) contact distances of the vertices from the object; None = compute.
         """
         errors = truths.body_errors(self._truth, body_track, self._fps)
         if self._truth.vertices is not None:
@@ -104,28 +107,29 @@ class StageErrors:
     ) -> Values:
         """Errors of skin, contact, slip and feet, by dataset without the prefix.
 
-        ``known``: (T, V) signed distances from the object; None = compute.
+        ``known``: (T, V) contact distances from the object; None = compute.
         """
         pve, counts, touching, skin, soles = [], [], [], [], []
         assert self._truth.vertices is not None
-        regions = body_track.model.regions
+        regions, faces = body_track.model.regions, body_track.model.faces.numpy()
+        tree = SurfaceTree(body_track.model.template.numpy(), faces) if known is None else None
         for t, vertices in enumerate(body_track.vertices()):
             skin.append(vertices[self._touched])
             soles.append([vertices[regions[foot]] for foot in _FEET])
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
-            if self._object is None or self._true_distance is None:
+            if self._object is None or self._true_facing is None:
                 continue
             distance = np.full(len(vertices), np.inf)  # the object was not found
             if known is not None:
                 distance = known[t]
-            elif track.known:
-                distance = self._object.surface.signed_distance(
-                    vertices.astype(np.float64),
+            elif track.known and tree is not None:
+                distance = self._object.surface.contact_distance(
+                    BodySurface(vertices.astype(np.float64), faces, tree),
                     track.rotation[t],
                     track.translation[t],
-                    reach=1.01 * max(self._threshold, *contact.SWEEP_M),
+                    self._reach,
                 )
-            counts.append(truths.contact_counts(distance, self._true_distance[t]))
+            counts.append(truths.contact_counts(distance, self._true_facing[t]))
             touching.append(contact.vertex_contact(distance, self._threshold))
         of_body = {
             **self._feet([np.stack(sole) for sole in zip(*soles, strict=True)], regions),
@@ -143,7 +147,7 @@ class StageErrors:
 
     def _slip(self, skin: np.ndarray, track: ObjectTrack) -> Values:
         """Slip (T,) of the skin vertices (T, N, 3) that are ever in true contact."""
-        assert self._true_distance is not None and self._object is not None
+        assert self._true_facing is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(skin), np.nan)}
         pose, true = (rigid(of.rotation, of.translation) for of in (track, self._truth))
@@ -152,7 +156,7 @@ class StageErrors:
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
         )
-        touching = contact.vertex_contact(self._true_distance[:, self._touched])
+        touching = contact.vertex_contact(self._true_facing[:, self._touched])
         speed = slip_speed(
             _local(skin, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,

@@ -129,8 +129,8 @@ def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
                 if key not in PER_VERTEX_METRICS:
                     is_text = METRICS.fields[key].dtype == "str"
                     writer.put(key, metrics.text(key) if is_text else metrics[key])
-            if "body_to_object" in metrics:
-                touching = vertex_contact(metrics["body_to_object"], CONTACT_M)
+            if "body_contact_distance" in metrics:
+                touching = vertex_contact(metrics["body_contact_distance"], CONTACT_M)
                 writer.put("body_contact_frames", touching.sum(0).astype(np.int32))
             with artefacts.read(paths.scene, SCENE) as scene:
                 for key, values in _rig(scene).items():

@@ -240,7 +240,7 @@ def object_errors(
 def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:
     """Confusion counts (W, 4) of a frame's body vertices for each threshold of the sweep.
 
-    Both arguments are signed distances (V,) to the object, metres.
+    Both arguments are contact distances (V,) to the object, metres.
     """
     return np.stack(
         [

@@ -78,7 +78,7 @@ def run(
             handled = HandledObject(mesh, fitted_object)
         measured = Measurement(handled, fitted_body, clouds, rig, settings.contact_mm * 1e-3)
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
-        true_distance = values.pop("true_distance", None)
+        true = [values.pop(key, None) for key in ("true_distance", "true_facing")]
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
         values |= _flags(images, paths)
@@ -87,12 +87,12 @@ def run(
         if known is not None:
             tracked = read_object(paths.object_track, "object_track")
             first_body = read_body(paths.body_fit, "body_fit", body_models, gender)
-            errors = StageErrors(known, true_distance, mesh, measured.threshold, images.fps)
+            errors = StageErrors(known, *true, mesh, measured.threshold, images.fps)
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
             values |= errors.of_object("joint", fitted_object)
             values |= errors.of_body(
-                "joint", fitted_body, fitted_object, values.get("body_to_object")
+                "joint", fitted_body, fitted_object, values.get("body_contact_distance")
             )
             values |= errors.about_truth(fitted_body.model.regions) | _extrinsics_errors(
                 setting, fitted["master_from_colour"], known

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 
 _ROUNDING = 1e-6  # error of distances in single precision, metres
+_ON_SURFACE = 1e-4  # distance below which a face's normal replaces the direction to it, metres
 
 
 class SurfaceTree:
@@ -74,6 +75,42 @@ class ShapedSurface:
         return _signed(
             queries, self._triangles, self._boxes, self._levels, float(reach), float(deepest)
         )
+
+    def opposed(
+        self, points: np.ndarray, normals: np.ndarray, signed: np.ndarray, reach: float, depth: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the nearest point of this surface that faces each point of another surface.
+
+        The nearest point of the surface faces the other surface if the signed distance decreases
+        along the normal. Otherwise only faces whose normal opposes ``normals`` are searched: within
+        ``reach`` in front of the point. Behind a point inside of the surface, within ``depth``, the
+        normals must oppose each other by 120 degrees or more: the sides of what penetrates do not.
+
+        Args:
+            points: (N, 3) of the other surface, metres.
+            normals: (N, 3) unit normals there; (0, 0, 0) if the other surface has no outside.
+            signed: (N,) signed distances of ``points``, all below ``reach``.
+            reach, depth: metres.
+
+        Returns:
+            (N,) int8: 2 = the nearest point, 1 = another point, 0 = none.
+            (N,) its distance, metres, inf if there is none.
+            (N, 3) the point, NaN if there is none.
+        """
+        count = len(points)
+        kind, away = np.zeros(count, np.int8), np.full(count, np.inf)
+        found = np.full((count, 3), np.nan)
+        _oppose(
+            np.ascontiguousarray(points, np.float32),
+            np.ascontiguousarray(normals, np.float32),
+            np.ascontiguousarray(signed, np.float64),
+            self._triangles,
+            self._boxes,
+            self._levels,
+            (float(reach), float(depth)),
+            (kind, away, found),
+        )
+        return kind, away, found
 
     def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
         """Set ``blocked`` (N,) bool of segments ``starts`` to ``ends`` (N, 3) that hit the mesh.
@@ -325,6 +362,77 @@ def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
 
 
 @numba.njit(cache=True, nogil=True)
+def _oppose(points, normals, signed, triangles, boxes, levels, limits, result):
+    """Find the opposed points of :meth:`ShapedSurface.opposed` by its arguments.
+
+    Args:
+        limits: reach in front of a point and depth behind it, metres.
+        result: kinds (N,), distances (N,) and points (N, 3), which are written.
+    """
+    kind, away, found = result
+    stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
+    last, most = 0, np.float32(np.inf)
+    for m in range(len(points)):
+        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+        nx, ny, nz = normals[m, 0], normals[m, 1], normals[m, 2]
+        square, last = _search(x, y, z, triangles, boxes, levels, most, last, stack, ahead)
+        dx, dy, dz = _from_triangle(x, y, z, triangles, last)
+        if square < _ON_SURFACE * _ON_SURFACE:
+            ux, uy, uz = _normal(triangles, last)
+            towards = nx * ux + ny * uy + nz * uz
+        else:
+            towards = (nx * dx + ny * dy + nz * dz) * (1 if signed[m] >= 0 else -1)
+        if towards < 0 or nx == ny == nz == 0:
+            kind[m], away[m] = 2, np.sqrt(np.float64(square))
+            found[m, 0], found[m, 1], found[m, 2] = x - dx, y - dy, z - dz
+            continue
+        front = np.float32(limits[0] ** 2)
+        behind = np.float32(limits[1] ** 2 if signed[m] < 0 else 0.0)
+        size, stack[0] = 1, 0
+        leaves, count = 1 << levels, len(triangles)
+        while size:
+            size -= 1
+            node = stack[size]
+            if _to_box(x, y, z, boxes, node) >= max(front, behind):
+                continue
+            if node < leaves - 1:
+                stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+                size += 2
+                continue
+            leaf = node - leaves + 1
+            for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+                ux, uy, uz = _normal(triangles, at)
+                opposed = nx * ux + ny * uy + nz * uz
+                if opposed >= 0:
+                    continue
+                dx, dy, dz = _from_triangle(x, y, z, triangles, at)
+                square = dx * dx + dy * dy + dz * dz
+                length = np.sqrt(ux * ux + uy * uy + uz * uz)
+                ahead_of = nx * dx + ny * dy + nz * dz < 0
+                most_sq = front if ahead_of else (behind if opposed < -0.5 * length else -1.0)
+                if square < most_sq:
+                    front, behind = min(front, square), min(behind, square)
+                    kind[m], away[m] = 1, np.sqrt(np.float64(square))
+                    found[m, 0], found[m, 1], found[m, 2] = x - dx, y - dy, z - dz
+
+
+@numba.njit(inline="always")
+def _normal(triangles, at):
+    """Return the normal of one of triangles (F, 3, 3), whose length is twice the area."""
+    ux, uy, uz = (
+        triangles[at, 1, 0] - triangles[at, 0, 0],
+        triangles[at, 1, 1] - triangles[at, 0, 1],
+        triangles[at, 1, 2] - triangles[at, 0, 2],
+    )
+    vx, vy, vz = (
+        triangles[at, 2, 0] - triangles[at, 0, 0],
+        triangles[at, 2, 1] - triangles[at, 0, 1],
+        triangles[at, 2, 2] - triangles[at, 0, 2],
+    )
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@numba.njit(cache=True, nogil=True)
 def _odd(x, y, z, triangles, boxes, levels, stack):
     """Return whether the ray from (x, y, z) along +z crosses the mesh an odd number of times."""
     leaves, count = 1 << levels, len(triangles)
@@ -390,7 +498,14 @@ def _to_box(x, y, z, boxes, node):
 
 @numba.njit(inline="always")
 def _to_triangle(x, y, z, triangles, at):
-    """Return the squared distance of a point to one of triangles (F, 3, 3).
+    """Return the squared distance of a point to one of triangles (F, 3, 3)."""
+    dx, dy, dz = _from_triangle(x, y, z, triangles, at)
+    return dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(inline="always")
+def _from_triangle(x, y, z, triangles, at):
+    """Return the vector to a point from the nearest point of one of triangles (F, 3, 3).
 
     It depends on the region of the triangle's plane that the point projects to: a corner, an edge
     or the inside (Ericson, Real-Time Collision Detection, 5.1.5).
@@ -424,5 +539,4 @@ def _to_triangle(x, y, z, triangles, at):
     else:
         scale = one / (va + vb + vc)
         s, t = vb * scale, vc * scale
-    qx, qy, qz = px - s * ux - t * vx, py - s * uy - t * vy, pz - s * uz - t * vz
-    return qx * qx + qy * qy + qz * qz
+    return px - s * ux - t * vx, py - s * uy - t * vy, pz - s * uz - t * vz

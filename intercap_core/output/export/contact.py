@@ -70,11 +70,12 @@ class VertexRuns:
     vertices: np.ndarray
     """(N,) int32 vertex indices."""
     distance: np.ndarray
-    """(N,) float32 signed distance to the other surface, metres, negative inside it."""
+    """(N,) float32 signed distance to the faced part of the other surface, metres, negative
+    inside."""
 
     @classmethod
     def of(cls, distance: np.ndarray) -> VertexRuns:
-        """Select vertices within ``CONTACT_M``, or inside, by signed distances (T, V), metres."""
+        """Select vertices in contact by contact distances (T, V), metres."""
         touching = vertex_contact(distance)
         offsets = np.concatenate([[0], np.cumsum(touching.sum(1))])
         return cls(
@@ -108,11 +109,11 @@ class ContactVertices:
         with artefacts.read(metrics, METRICS) as artefact:
             for key, surface, count in (
                 (
-                    "body_to_object",
+                    "body_contact_distance",
                     f"the body in {motion.model.path.name}",
                     motion.model.num_vertices,
                 ),
-                ("object_to_body", f"the mesh of object {mesh.name!r}", len(mesh.vertices)),
+                ("object_contact_distance", f"the mesh of object {mesh.name!r}", len(mesh.vertices)),
             ):
                 if key not in artefact:
                     raise UserError(

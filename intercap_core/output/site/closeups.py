@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.evaluation import flags
-from intercap_core.evaluation.contact import CONTACT_M
-from intercap_core.evaluation.proximity import PosedObject
+from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -26,6 +27,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.output.site.drawing import (
     ColouredMesh,
     EncodedImage,
@@ -83,10 +85,21 @@ class PosedPair:
     """(Fo, 3) of the object."""
     watertight: bool
 
-    def distance(self, ids: np.ndarray) -> np.ndarray:
-        """Return signed distances (N,) of the body vertices ``ids`` (N,) to the object."""
-        surface = PosedObject(self.vertices, self.faces, watertight=self.watertight)
-        return surface.signed_distance(self.body[ids], np.eye(3), np.zeros(3))
+    @cached_property
+    def _object(self) -> PosedObject:
+        return PosedObject(self.vertices, self.faces, watertight=self.watertight)
+
+    def distance(self) -> np.ndarray:
+        """Return signed distances (V,) of the body's vertices to the object."""
+        return self._object.signed_distance(self.body, np.eye(3), np.zeros(3))
+
+    def touching(self, faces: np.ndarray) -> np.ndarray:
+        """Return the mask (V,) of the vertices of a body with ``faces`` (F, 3) in contact."""
+        body = BodySurface(self.body, faces, SurfaceTree(self.body, faces))
+        reach = 1.01 * CONTACT_M
+        return vertex_contact(
+            self._object.contact_distance(body, np.eye(3), np.zeros(3), reach)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +207,7 @@ def closeup(handling: Handling, hold: Hold) -> EncodedImage:
     sheet = np.full((head + len(views) * step - gap, len(pairs) * step - gap, 3), 225, np.uint8)
     white = np.ones((_CELL_PX, _CELL_PX, 3), np.float32)
     for c, (column, pair) in enumerate(zip(handling.columns, pairs, strict=True)):
-        colours = _skin_colours(pair, arms)
+        colours = _skin_colours(pair, model)
         for row, view in enumerate(views):
             picture = draw(_coloured(pair, arms, colours, view), _lens(_CELL_PX))
             y, x = head + row * step, c * step
@@ -234,7 +247,7 @@ def _viewpoints(
     """
     target = fitted.body[hand].mean(0)
     near = np.zeros(len(fitted.body), bool)
-    near[hand[fitted.distance(hand) < 0.03]] = True  # skin within 30 mm of the object
+    near[hand[fitted.distance()[hand] < 0.03]] = True  # skin within 30 mm of the object
     showing = near[arms].any(1)  # by face
     lens, candidates = _lens(48), []
     for direction in _directions(up):
@@ -276,11 +289,10 @@ def _look_at(target: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.nd
     return rigid(turn, turn @ (direction * _DISTANCE_M - target))
 
 
-def _skin_colours(pair: PosedPair, arms: np.ndarray) -> np.ndarray:
+def _skin_colours(pair: PosedPair, model: BodyModel) -> np.ndarray:
     """Return colours (V, 3). Skin that touches the object, or is inside it, is red."""
-    used = np.unique(arms)
     colours = np.tile(BODY_COLOUR, (len(pair.body), 1))
-    colours[used[pair.distance(used) < CONTACT_M]] = TOUCHING_COLOUR
+    colours[pair.touching(model.faces.numpy())] = TOUCHING_COLOUR
     return colours
 
 

@@ -18,7 +18,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
-from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.segmented import SegmentedClouds, read_clouds
 from intercap_core.evaluation.truth import Truth
 from intercap_core.formats.recordings.frames import Frames
@@ -155,8 +155,8 @@ def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> 
 def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
     """Add touching vertices as bits (T, ceil(V / 8)); return the reasons of flags."""
     with artefacts.read(metrics, METRICS) as measured:
-        if "body_to_object" in measured:
-            touching = measured["body_to_object"] <= CONTACT_M
+        if "body_contact_distance" in measured:
+            touching = vertex_contact(measured["body_contact_distance"])
             if touching.shape[1] != num_vertices:
                 raise UserError(
                     f"{metrics}: sequence {measured.attributes['sequence']!r} was measured on a "

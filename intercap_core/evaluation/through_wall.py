@@ -1,0 +1,83 @@
+"""Contact points behind a wall, by a ray cast that shares no code with the rule of contact.
+
+A touched point of an object is behind a wall if every straight way from it to the body within the
+threshold crosses the object or is within it. A touched point inside the body is behind a wall if on
+every line through it the body ends sooner on the point's free side than through the object, like a
+finger that passed through the wall of a cup.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core.geometry.rigid.distance import DistanceField, o3d
+
+_OFF_M = 2e-5  # segments start and end this far from the surfaces
+_LINES = 40  # lines through a point inside the body
+
+
+def behind_wall(
+    points: np.ndarray,
+    normals: np.ndarray,
+    object_: tuple[np.ndarray, np.ndarray],
+    body: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Mask (N,) of the touched points of an object that are behind a wall of it.
+
+    Args:
+        points, normals: (N, 3) of the object's surface, metres, and outward unit normals.
+        object_, body: vertices (V, 3) in the frame of the points, and faces (F, 3).
+    """
+    result = np.zeros(len(points), bool)
+    if len(points) == 0:
+        return result
+    wall, skin = _scene(*object_), _scene(*body)
+    solid = DistanceField(*object_, threads=1)
+    inside = DistanceField(*body, threads=1).inside(points)
+    result[inside] = True
+    for ray in _directions(_LINES):
+        ahead = np.where(normals @ ray >= 0, 1.0, -1.0)[:, None] * ray
+        through = _first_hit(skin, points, -ahead)
+        crosses = _first_hit(wall, points - _OFF_M * ahead, -ahead) < through
+        result[inside] &= (crosses & (_first_hit(skin, points, ahead) < through))[inside]
+    triangles = body[0][body[1]]
+    low, high = points.min(0) - CONTACT_M, points.max(0) + CONTACT_M
+    triangles = triangles[((triangles.max(1) > low) & (triangles.min(1) < high)).all(1)]
+    for at in np.flatnonzero(~inside):
+        start = np.broadcast_to(points[at], (len(triangles), 3))
+        ways = trimesh.triangles.closest_point(triangles, start) - start
+        length = np.linalg.norm(ways, axis=1)
+        ways, length = ways[length < CONTACT_M + _OFF_M], length[length < CONTACT_M + _OFF_M]
+        along = ways / np.maximum(length, _OFF_M)[:, None]
+        starts = points[at] + _OFF_M * along
+        blocked = _first_hit(wall, starts, along) < length - 2 * _OFF_M
+        result[at] = (blocked | solid.inside(starts)).all()
+    return result
+
+
+def _directions(count: int) -> np.ndarray:
+    """Unit vectors (N, 3) spread evenly over the sphere (Fibonacci lattice)."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    flat = np.sqrt(1 - height**2)
+    return np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
+
+
+def _scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Return the ray caster of a mesh (V, 3), (F, 3)."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
+    )
+    return scene
+
+
+def _first_hit(scene: Any, starts: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the length (N,) of rays (N, 3) to the first surface, metres; inf without one."""
+    rays = np.concatenate([starts, directions], axis=1).astype(np.float32)
+    return scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy().astype(float)
