@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 
@@ -109,18 +108,14 @@ class BodySurface:
         """Unsigned distance (N,) of points (N, 3), at most ``DEEPEST_M``."""
         return self.surface.distance(points, DEEPEST_M)
 
-    @cached_property
-    def _normals(self) -> np.ndarray:
-        return vertex_normals(self.vertices, self._faces)
-
     def facing(self, object_: ShapedSurface, signed: np.ndarray, reach: float) -> np.ndarray:
         """Contact distances (V,) of the body's vertices to an object, by ``signed`` (V,) distances.
 
         See :func:`.facing_distance`; capped at ``REACH_M``, which stands for none within ``reach``.
         """
-        distance = facing_distance(
-            self.vertices, self._normals, signed, self.surface, object_, reach
-        )
+        around = (signed < reach)[self._faces].any(1)
+        normals = vertex_normals(self.vertices, self._faces[around])
+        distance = facing_distance(self.vertices, normals, signed, self.surface, object_, reach)
         return np.minimum(distance, REACH_M)
 
 

@@ -14,9 +14,7 @@ import numpy as np
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface
 
 _OFF_M = 2e-5  # ends of a segment are moved off the surfaces that they lie on
-# Depth to which a point that passed through a wall is opposed to the wall's other side, metres: the
-# threshold of contact.
-_THROUGH_M = 0.0045
+_OTHER_M = 0.01  # farthest point that is faced although another point of the surface is nearer
 
 
 def facing_distance(
@@ -45,7 +43,7 @@ def facing_distance(
     if len(near) == 0:
         return distance
     start, normal, outside = points[near], normals[near], signed[near] >= 0
-    kind, away, end = other.opposed(start, normal, signed[near], reach, min(reach, _THROUGH_M))
+    kind, away, end = other.opposed(start, normal, signed[near], min(reach, _OTHER_M))
     nearest, another = kind == 2, kind == 1
     behind = another & (((end - start) * normal).sum(1) < 0)
     along = (end - start) / np.maximum(away, _OFF_M)[:, None]

@@ -19,6 +19,10 @@ import numpy as np
 
 _ROUNDING = 1e-6  # error of distances in single precision, metres
 _ON_SURFACE = 1e-4  # distance below which a face's normal replaces the direction to it, metres
+# Least cosine between a normal and the direction to a point that the surface faces. The normal of a
+# vertex is the mean of faces that differ, so a point nearer to its plane may be behind one. Of 0 to
+# 0.5, 0.3 has the largest F1 of contact by vertex on four recordings of the studio.
+_FACING = 0.3
 
 
 class SurfaceTree:
@@ -77,20 +81,20 @@ class ShapedSurface:
         )
 
     def opposed(
-        self, points: np.ndarray, normals: np.ndarray, signed: np.ndarray, reach: float, depth: float
+        self, points: np.ndarray, normals: np.ndarray, signed: np.ndarray, reach: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the nearest point of this surface that faces each point of another surface.
 
         The nearest point of the surface faces the other surface if the signed distance decreases
-        along the normal. Otherwise only faces whose normal opposes ``normals`` are searched: within
-        ``reach`` in front of the point. Behind a point inside of the surface, within ``depth``, the
-        normals must oppose each other by 120 degrees or more: the sides of what penetrates do not.
+        along the normal. Otherwise only faces within ``reach`` whose normal opposes ``normals`` are
+        searched, in front of the point, or behind a point that is inside of the surface. Behind it
+        the normals differ by 120 degrees or more: those at the sides of what penetrates do not.
 
         Args:
             points: (N, 3) of the other surface, metres.
             normals: (N, 3) unit normals there; (0, 0, 0) if the other surface has no outside.
-            signed: (N,) signed distances of ``points``, all below ``reach``.
-            reach, depth: metres.
+            signed: (N,) signed distances of ``points`` to this surface.
+            reach: of the second search, metres.
 
         Returns:
             (N,) int8: 2 = the nearest point, 1 = another point, 0 = none.
@@ -107,7 +111,7 @@ class ShapedSurface:
             self._triangles,
             self._boxes,
             self._levels,
-            (float(reach), float(depth)),
+            float(reach),
             (kind, away, found),
         )
         return kind, away, found
@@ -362,11 +366,10 @@ def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
 
 
 @numba.njit(cache=True, nogil=True)
-def _oppose(points, normals, signed, triangles, boxes, levels, limits, result):
+def _oppose(points, normals, signed, triangles, boxes, levels, reach, result):
     """Find the opposed points of :meth:`ShapedSurface.opposed` by its arguments.
 
     Args:
-        limits: reach in front of a point and depth behind it, metres.
         result: kinds (N,), distances (N,) and points (N, 3), which are written.
     """
     kind, away, found = result
@@ -379,21 +382,30 @@ def _oppose(points, normals, signed, triangles, boxes, levels, limits, result):
         dx, dy, dz = _from_triangle(x, y, z, triangles, last)
         if square < _ON_SURFACE * _ON_SURFACE:
             ux, uy, uz = _normal(triangles, last)
-            towards = nx * ux + ny * uy + nz * uz
+            towards, length = nx * ux + ny * uy + nz * uz, np.sqrt(ux * ux + uy * uy + uz * uz)
         else:
-            towards = (nx * dx + ny * dy + nz * dz) * (1 if signed[m] >= 0 else -1)
-        if towards < 0 or nx == ny == nz == 0:
+            towards, length = nx * dx + ny * dy + nz * dz, np.sqrt(square)
+            towards *= 1 if signed[m] >= 0 else -1
+        if towards < -_FACING * length or nx == ny == nz == 0:
             kind[m], away[m] = 2, np.sqrt(np.float64(square))
             found[m, 0], found[m, 1], found[m, 2] = x - dx, y - dy, z - dz
             continue
-        front = np.float32(limits[0] ** 2)
-        behind = np.float32(limits[1] ** 2 if signed[m] < 0 else 0.0)
+        front = np.float32(reach * reach)
+        behind = front if signed[m] < 0 else np.float32(0)
         size, stack[0] = 1, 0
         leaves, count = 1 << levels, len(triangles)
         while size:
             size -= 1
             node = stack[size]
-            if _to_box(x, y, z, boxes, node) >= max(front, behind):
+            box_sq, box = _to_box(x, y, z, boxes, node), boxes[node]
+            if box_sq >= max(front, behind):
+                continue
+            # the point faces nothing in the box
+            if box_sq >= behind and (
+                max(nx * (box[0] - x), nx * (box[3] - x))
+                + max(ny * (box[1] - y), ny * (box[4] - y))
+                + max(nz * (box[2] - z), nz * (box[5] - z))
+            ) < 0.999 * _FACING * np.sqrt(box_sq):
                 continue
             if node < leaves - 1:
                 stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
@@ -407,9 +419,11 @@ def _oppose(points, normals, signed, triangles, boxes, levels, limits, result):
                     continue
                 dx, dy, dz = _from_triangle(x, y, z, triangles, at)
                 square = dx * dx + dy * dy + dz * dz
-                length = np.sqrt(ux * ux + uy * uy + uz * uz)
-                ahead_of = nx * dx + ny * dy + nz * dz < 0
-                most_sq = front if ahead_of else (behind if opposed < -0.5 * length else -1.0)
+                length, towards = np.sqrt(ux * ux + uy * uy + uz * uz), nx * dx + ny * dy + nz * dz
+                if towards < 0:
+                    most_sq = front if towards < -_FACING * np.sqrt(square) else np.float32(0)
+                else:
+                    most_sq = behind if opposed < -0.5 * length else np.float32(0)
                 if square < most_sq:
                     front, behind = min(front, square), min(behind, square)
                     kind[m], away[m] = 1, np.sqrt(np.float64(square))
