@@ -2,7 +2,7 @@
 
 A touched point of an object is behind a wall if every straight way from it to the body within the
 threshold crosses the object or is within it. A touched point inside the body is behind a wall if on
-every line through it the body ends sooner on the point's free side than through the object, like a
+every steep line through it the body ends sooner on the point's free side than through the object, like a
 finger that passed through the wall of a cup.
 """
 
@@ -17,7 +17,8 @@ from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.geometry.rigid.distance import DistanceField, o3d
 
 _OFF_M = 2e-5  # segments start and end this far from the surfaces
-_LINES = 40  # lines through a point inside the body
+_LINES = 100  # lines through a point inside the body
+_STEEP = 0.3  # least cosine between a line and the normal: flat ones hardly pass through a wall
 
 
 def behind_wall(
@@ -40,10 +41,12 @@ def behind_wall(
     inside = DistanceField(*body, threads=1).inside(points)
     result[inside] = True
     for ray in _directions(_LINES):
-        ahead = np.where(normals @ ray >= 0, 1.0, -1.0)[:, None] * ray
+        along = normals @ ray
+        ahead = np.sign(along)[:, None] * ray
         through = _first_hit(skin, points, -ahead)
         crosses = _first_hit(wall, points - _OFF_M * ahead, -ahead) < through
-        result[inside] &= (crosses & (_first_hit(skin, points, ahead) < through))[inside]
+        sooner = _first_hit(skin, points, ahead) < through
+        result[inside] &= ((crosses & sooner) | (abs(along) < _STEEP))[inside]
     triangles = body[0][body[1]]
     low, high = points.min(0) - CONTACT_M, points.max(0) + CONTACT_M
     triangles = triangles[((triangles.max(1) > low) & (triangles.min(1) < high)).all(1)]
