@@ -13,12 +13,50 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from intercap_core.evaluation.contact import CONTACT_M
+from intercap_core import artefacts
+from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.geometry.rigid.distance import DistanceField, o3d
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surfaces import vertex_normals
+from intercap_core.schemas import METRICS
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
+# Mean thickness (twice the volume by the area) below which an object is thin-walled, metres: a body
+# can be within the threshold of both of its sides.
+_THIN_M = 2 * CONTACT_M
 _OFF_M = 2e-5  # segments start and end this far from the surfaces
 _LINES = 100  # lines through a point inside the body
 _STEEP = 0.3  # least cosine between a line and the normal: flat ones hardly pass through a wall
+
+
+def count_walls(paths: SequencePaths, models: SequenceModels) -> np.ndarray:
+    """Counts (2,): touched vertices of a thin-walled object, and those of them behind a wall.
+
+    They are counted in all frames of a sequence after ``joint``; 0 for other objects. The artefacts
+    of ``joint`` and ``metrics`` are read.
+    """
+    counts = np.zeros(2)
+    if models.object_ is None:
+        return counts
+    mesh = ObjectMesh.load(models.object_)
+    if not mesh.watertight or mesh.thickness > _THIN_M:
+        return counts
+    with artefacts.read(paths.metrics, METRICS) as metrics:
+        if "object_contact_distance" not in metrics:
+            return counts
+        touched = vertex_contact(metrics["object_contact_distance"])
+    body = read_body(paths.joint, "joint", models.body_models, models.gender)
+    track, faces = read_object(paths.joint, "joint"), body.model.faces.numpy()
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    for t in np.flatnonzero(touched.any(1)):
+        skin = (body.frame(int(t)) - track.translation[t]) @ track.rotation[t]
+        at = touched[t]
+        hidden = behind_wall(
+            mesh.vertices[at], normals[at], (mesh.vertices, mesh.faces), (skin, faces)
+        )
+        counts += (at.sum(), hidden.sum())
+    return counts
 
 
 def behind_wall(

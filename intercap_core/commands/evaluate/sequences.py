@@ -20,6 +20,7 @@ from intercap_core.commands.evaluate.part import (
 )
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.through_wall import count_walls
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
@@ -65,6 +66,8 @@ class MeasuredSequence:
     metrics: SequenceMetrics
     annotated: bool
     """Whether the sequence has annotations."""
+    walls: np.ndarray
+    """(2,) touched vertices of a thin-walled object, and those of them behind a wall."""
 
 
 Sequences = Measured[MeasuredSequence]
@@ -73,7 +76,8 @@ Sequences = Measured[MeasuredSequence]
 def measure(project: Project, sequence: str) -> MeasuredSequence:
     """Read the metrics of one recording."""
     made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
-    return MeasuredSequence(SequenceMetrics.read(project.artefact(sequence, "metrics")), made)
+    paths, models = project.paths(sequence), project.models(sequence)
+    return MeasuredSequence(SequenceMetrics.read(paths.metrics), made, count_walls(paths, models))
 
 
 def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
@@ -162,6 +166,9 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
         for key, value in with_spread(flat_areas, sequences).items():
             area, _, name = key.partition(".")
             found[f"{area}{suffix}.{name}"] = value
+    touched, behind = sum((e.walls for m in evaluations for e in m.errors), np.zeros(2))
+    if touched:
+        found["contact.through_wall_share"] = float(behind / touched)
     if "joint_annotated.contact_detected_f1" in found:
         found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
     return found

@@ -105,6 +105,13 @@ class ObjectMesh:
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
 
+    @property
+    def thickness(self) -> float:
+        """Mean thickness of a closed mesh, metres: twice its volume by its area."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        volume = (a * np.cross(b, c)).sum() / 6
+        return float(4 * volume / np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
     def simplified(self, max_faces: int, tolerance_m: float = 0.0005) -> ObjectMesh:
         """Return the object with about ``max_faces`` faces, for rendering and search.
 

@@ -93,7 +93,7 @@ def test_heatmaps_are_shares_of_frames(site: Path, captures: dict[str, fitted.Ca
     expected = np.zeros(len(body))
     for capture in captures.values():
         with artefacts.read(capture.paths["metrics"], METRICS) as measured:
-            expected += (measured["body_to_object"] <= 0.0045).sum(0)
+            expected += (measured["body_contact_distance"] <= 0.0045).sum(0)
     assert body == pytest.approx(expected / 8)
     ball = likelihood[offsets[1] : offsets[2]]
     assert ball.max() == 1 and 0 < (ball > 0).mean() < 0.2

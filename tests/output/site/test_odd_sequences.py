@@ -52,9 +52,9 @@ def _set(artefact: Path, **attributes: object) -> None:
 
 def _of_another_body(folder: Path) -> None:
     with h5py.File(folder / "metrics.h5", "r+") as file:
-        distances = file["body_to_object"][:, :1000]
-        del file["body_to_object"]
-        file.create_dataset("body_to_object", data=distances, fletcher32=True)
+        distances = file["body_contact_distance"][:, :1000]
+        del file["body_contact_distance"]
+        file.create_dataset("body_contact_distance", data=distances, fletcher32=True)
 
 
 DAMAGES: dict[str, tuple[Damage, list[str]]] = {
