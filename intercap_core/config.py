@@ -254,7 +254,7 @@ class ExportSettings(Model):
 
 
 class CardSettings(Model):
-    """Texts of the dataset's card."""
+    """The dataset's card and overview."""
 
     title: str = ""
     """Title; empty = the dataset's name."""
@@ -279,6 +279,9 @@ class CardSettings(Model):
     grows."""
     test_objects: tuple[Name, ...] = ()
     """Objects of the test set; empty = chosen by share."""
+    heatmap_scale: Literal["own", "common"] = "own"
+    """Colour scale of the contact heatmaps: own = each map's maximum has the last colour; common =
+    the largest maximum of all maps, so that colours compare between maps."""
 
 
 StudioFault = Literal[
@@ -453,7 +456,7 @@ class Config(Model):
     export: ExportSettings = ExportSettings()
     """Files for other tools."""
     card: CardSettings = CardSettings()
-    """The dataset's card."""
+    """The dataset's card and overview."""
     cluster: ClusterSettings = ClusterSettings()
     """Resources that jobs request from a cluster's scheduler."""
     studio: StudioSettings | None = None

@@ -290,9 +290,9 @@ class Measurement:
         if truth.vertices is not None:
             vertices = truth.vertices[t].astype(np.float64)
             distance = surface.signed_distance(vertices, rotation, translation)
-            facing = BodySurface(vertices, self.faces, self.tree).facing(
-                surface.placed(rotation, translation), distance, contact.facing_reach(self.threshold)
-            )
+            reach = contact.facing_reach(self.threshold)
+            body = BodySurface(vertices, self.faces, self.tree)
+            facing = body.facing(surface.placed(rotation, translation), distance, reach)
             row["true_distance"] = distance.astype(np.float32)
             row["true_facing"] = facing.astype(np.float32)
             row["truth/penetration_mean"] = contact.depths(distance).mean

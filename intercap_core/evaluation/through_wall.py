@@ -2,8 +2,8 @@
 
 A touched point of an object is behind a wall if every straight way from it to the body within the
 threshold crosses the object or is within it. A touched point inside the body is behind a wall if on
-every steep line through it the body ends sooner on the point's free side than through the object, like a
-finger that passed through the wall of a cup.
+every steep line through it the body ends sooner on the point's free side than through the object,
+like a finger that passed through the wall of a cup.
 """
 
 from __future__ import annotations

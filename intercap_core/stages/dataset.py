@@ -92,7 +92,12 @@ def run(
     }
     tables.write(results / "tables", written)
     heat = collect_heatmaps(found)
-    surfaces, doubts = _body_heat(found, heat, body_models)
+    common = None
+    if card.heatmap_scale == "common":
+        common = max(
+            highest(map_) for map_ in (heat.body, *(o.likelihood for o in heat.objects.values()))
+        )
+    surfaces, doubts = _body_heat(found, heat, body_models, common)
     doubts |= _unlisted(found, objects)
     remarks = {name: "; ".join(reasons) for name, reasons in heat.left_out.items()} | doubts
     for name, why in remarks.items():
@@ -111,7 +116,10 @@ def run(
         table=by_sequence,
         groups={name: table for name, table in [*groups.items(), ("cameras", rig)] if len(table)},
         surfaces=surfaces,
-        objects=[_object_heat(name, heat, objects) for name in heat.objects if name in objects],
+        objects=[
+            _object_heat(name, heat, objects, common) for name in heat.objects if name in objects
+        ],
+        common_scale=common,
         body_frames=heat.body_frames,
         page_of={s.name: f"sequences/{s.name}/index.html" for s in found},
         failed=unreported,
@@ -136,11 +144,15 @@ def _read(summaries: Mapping[str, Path]) -> tuple[list[SequenceSummary], dict[st
 
 
 def _body_heat(
-    summaries: Sequence[SequenceSummary], heat: Heatmaps, body_models: BodyModels
+    summaries: Sequence[SequenceSummary],
+    heat: Heatmaps,
+    body_models: BodyModels,
+    common: float | None,
 ) -> tuple[list[Heat], dict[str, str]]:
     """Pictures of the heatmaps of the body and both hands, and remarks by sequence.
 
     They are drawn on the body of the first sequence whose body file still exists unchanged.
+    ``common``: likelihood of the last colour; None = each map's own maximum.
     """
     doubts: dict[str, str] = {}
     if not heat.body_frames:
@@ -154,7 +166,7 @@ def _body_heat(
             model = BodyModel.load(
                 path, num_betas=body.num_betas, num_expression=body.num_expression
             )
-            surfaces = body_surfaces(model, heat.body)
+            surfaces = body_surfaces(model, heat.body, common)
             return [Heat(*surface, heat.body_frames) for surface in surfaces], doubts
         doubts[summary.name] = (
             f"{path} is not the body file of the fit (digest {summary.body.digest}): the body's "
@@ -175,12 +187,16 @@ def _unlisted(
     }
 
 
-def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> Heat:
-    """Pictures of the heatmap of one object."""
+def _object_heat(
+    name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry], common: float | None
+) -> Heat:
+    """Pictures of the heatmap of one object; ``common`` as in :func:`_body_heat`."""
     mesh = ObjectMesh.load(objects[name])
     found = heat.objects[name]
     top = highest(found.likelihood)
-    return Heat(name, object_pictures(mesh.vertices, mesh.faces, found, top), top, found.frames)
+    return Heat(
+        name, object_pictures(mesh.vertices, mesh.faces, found, common or top), top, found.frames
+    )
 
 
 def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:

@@ -78,7 +78,8 @@ def run(
             handled = HandledObject(mesh, fitted_object)
         measured = Measurement(handled, fitted_body, clouds, rig, settings.contact_mm * 1e-3)
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
-        true = [values.pop(key, None) for key in ("true_distance", "true_facing")]
+        true_distance = values.pop("true_distance", None)
+        true_facing = values.pop("true_facing", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
         values |= _flags(images, paths)
@@ -87,7 +88,9 @@ def run(
         if known is not None:
             tracked = read_object(paths.object_track, "object_track")
             first_body = read_body(paths.body_fit, "body_fit", body_models, gender)
-            errors = StageErrors(known, *true, mesh, measured.threshold, images.fps)
+            errors = StageErrors(
+                known, true_distance, true_facing, mesh, measured.threshold, images.fps
+            )
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
             values |= errors.of_object("joint", fitted_object)

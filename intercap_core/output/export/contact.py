@@ -113,7 +113,11 @@ class ContactVertices:
                     f"the body in {motion.model.path.name}",
                     motion.model.num_vertices,
                 ),
-                ("object_contact_distance", f"the mesh of object {mesh.name!r}", len(mesh.vertices)),
+                (
+                    "object_contact_distance",
+                    f"the mesh of object {mesh.name!r}",
+                    len(mesh.vertices),
+                ),
             ):
                 if key not in artefact:
                     raise UserError(

@@ -97,9 +97,7 @@ class PosedPair:
         """Return the mask (V,) of the vertices of a body with ``faces`` (F, 3) in contact."""
         body = BodySurface(self.body, faces, SurfaceTree(self.body, faces))
         reach = 1.01 * CONTACT_M
-        return vertex_contact(
-            self._object.contact_distance(body, np.eye(3), np.zeros(3), reach)
-        )
+        return vertex_contact(self._object.contact_distance(body, np.eye(3), np.zeros(3), reach))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,12 +27,13 @@ def colours(values: np.ndarray, top: float) -> np.ndarray:
 
 
 def body_surfaces(
-    model: BodyModel, likelihood: np.ndarray
+    model: BodyModel, likelihood: np.ndarray, common: float | None = None
 ) -> list[tuple[str, list[EncodedImage], float]]:
     """Draw the body with lowered arms from both sides, and each hand from both sides.
 
-    Returns name, pictures and highest likelihood of each surface. The highest likelihood has the
-    last colour, as in the paper's figure, because hands touch far more often than other parts.
+    Returns name, pictures and highest likelihood of each surface. The last colour is that of the
+    likelihood ``common``. If it is None, it is the surface's own highest likelihood, as in the
+    paper's figure, because hands touch far more often than other parts.
     """
     params = model.zeros(1)
     for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
@@ -40,7 +41,7 @@ def body_surfaces(
     with torch.no_grad():
         standing = model.forward(params).vertices[0].numpy().astype(np.float64)
     faces, top = model.faces.numpy(), highest(likelihood)
-    paint, up = colours(likelihood, top), np.array([0, 1.0, 0])
+    paint, up = colours(likelihood, common or top), np.array([0, 1.0, 0])
     whole = [
         _draw_from(standing, faces, paint, view, up, (280, 480), name)
         for name, view in (("front", [0, 0, 1.0]), ("back", [0, 0, -1.0]))
@@ -55,7 +56,7 @@ def body_surfaces(
         kept = faces[shown[faces].all(1)]
         fingers = np.array([outwards, 0, 0])  # in the T-pose, fingers point away from the body
         top = highest(likelihood[shown])
-        paint = colours(likelihood, top)
+        paint = colours(likelihood, common or top)
         hand = [
             _draw_from(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
             for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0]))

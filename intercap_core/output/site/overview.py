@@ -84,6 +84,8 @@ class DatasetContent:
     """Remarks of the merge about other sequences."""
     changed: Sequence[tuple[str, str, str]] = ()
     """Name, value and default of each setting that differs from its default."""
+    common_scale: float | None = None
+    """Likelihood of the last colour of all heatmaps; None = each map's own maximum."""
 
 
 def page(content: DatasetContent) -> str:
@@ -251,6 +253,7 @@ def _heat(content: DatasetContent) -> dict[str, Any]:
     return {
         "gradient": f"linear-gradient(90deg, {stops})",
         "body_frames": content.body_frames,
+        "common": content.common_scale,
         "surfaces": [_surface(heat) for heat in content.surfaces],
         "objects": [_surface(heat) for heat in content.objects],
     }
