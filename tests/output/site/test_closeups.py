@@ -94,7 +94,8 @@ def test_every_cell_shows_skin_and_object(handling: Handling) -> None:
     ball = ((red - blue > 60) & (green - blue > 20)).sum((2, 3))
     assert (skin > 500).all() and (ball > 500).all()
     touching = ((red - green > 60) & (np.abs(green - blue) < 40)).sum((2, 3))
-    assert touching[:, 2].max() > 10  # the palm is 1 mm inside the true ball
+    # the palm is 1 mm inside the true ball; skin that faces away from the ball is not red
+    assert touching[:, 2].max() > 5
     assert picture.data == closeups.closeup(handling, hold).data
     # the fits differ by what was put in, so that their cells do as well
     assert np.abs(shown[:, 1] - shown[:, 2]).max() > 100

@@ -16,7 +16,7 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.annotation import ContactInterval
-from intercap_core.config import PageSettings
+from intercap_core.config import CardSettings, PageSettings
 from intercap_core.schemas import HEATMAPS, METRICS
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import page
@@ -83,6 +83,15 @@ def test_all_files_are_there(site: Path) -> None:
     }  # fmt: skip
     assert len(pd.read_parquet(site / "tables" / "sequences.parquet")) == 2
     assert len(pd.read_parquet(site / "tables" / "frames.parquet")) == 8
+
+
+def test_a_common_scale_is_that_of_all_heatmaps(
+    captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
+    summaries = write_summaries(captures, tmp_path)
+    path = merge(summaries, captures, tmp_path, card=CardSettings(heatmap_scale="common"))
+    text = " ".join(_read(path).text)
+    assert "100 % of the frames, in all maps" in text and "map's maximum" not in text
 
 
 def test_heatmaps_are_shares_of_frames(site: Path, captures: dict[str, fitted.Capture]) -> None:

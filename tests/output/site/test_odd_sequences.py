@@ -52,9 +52,10 @@ def _set(artefact: Path, **attributes: object) -> None:
 
 def _of_another_body(folder: Path) -> None:
     with h5py.File(folder / "metrics.h5", "r+") as file:
-        distances = file["body_contact_distance"][:, :1000]
-        del file["body_contact_distance"]
-        file.create_dataset("body_contact_distance", data=distances, fletcher32=True)
+        for name in ("body_to_object", "body_contact_distance"):
+            distances = file[name][:, :1000]
+            del file[name]
+            file.create_dataset(name, data=distances, fletcher32=True)
 
 
 DAMAGES: dict[str, tuple[Damage, list[str]]] = {
