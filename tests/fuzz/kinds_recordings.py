@@ -37,6 +37,7 @@ from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.studio.calibration import write_calibration
+from tests.cases.test_detections import person_of
 from tests.formats.calibration.test_opencv_calibration import example, write_node
 from tests.formats.calibration.test_other_tools import FORMS, RECORDED, VIEWS
 from tests.fuzz.plausible import IMAGE_SIZE, Kind, Notes, within
@@ -199,8 +200,9 @@ def _person(count: int) -> np.ndarray:
 
 
 def _make_openpose(folder: Path) -> None:
-    lists = {"pose": 25, "hand_left": 21, "hand_right": 21, "face": 70}
+    lists = {"hand_left": 21, "hand_right": 21, "face": 70}
     person = {f"{k}_keypoints_2d": _person(n).ravel().tolist() for k, n in lists.items()}
+    person["pose_keypoints_2d"] = person_of("body_25")
     (folder / "k1").mkdir()
     for n in range(4):
         content = json.dumps({"version": 1.3, "people": [person, person]})
