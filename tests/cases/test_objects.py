@@ -37,6 +37,16 @@ def test_relative_indices_give_the_same_solid(tmp_path):
     assert relative.watertight and len(relative.faces) == len(absolute.faces) == 24
 
 
+@pytest.mark.parametrize(
+    ("before", "after"), [(" ", "\t"), ("\nv", "\n  v"), ("\nf", "\n\tf"), ("\nf", " # note\nf")]
+)
+def test_spaces_and_comments_of_obj_are_read(tmp_path, before, after):
+    path = box(tmp_path, "obj")
+    vertices = load(path).vertices
+    path.write_text(("\n" + path.read_text()).replace(before, after))
+    np.testing.assert_array_equal(load(path).vertices, vertices)
+
+
 def test_relative_indices_before_the_first_vertex_are_refused(tmp_path):
     path = tmp_path / "box.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 -2 -1\n")
@@ -68,6 +78,12 @@ def test_contact_vertices_have_the_numbers_of_a_ply_with_texture(tmp_path):
     mesh = load(tmp_path / "box.ply", contact_vertices=tmp_path / "contact.json")
     touched = np.unique(mesh.vertices[mesh.contact_vertices].round(5), axis=0)
     np.testing.assert_allclose(touched, np.unique(corners.vertices[[5, 6]], axis=0), atol=1e-5)
+
+
+def test_a_list_of_contact_vertices_of_an_stl_is_doubtful(tmp_path, caplog):
+    (tmp_path / "contact.json").write_text("[5, 6]")
+    load(box(tmp_path, "stl"), contact_vertices=tmp_path / "contact.json")
+    assert "STL numbers no vertices" in caplog.text
 
 
 def test_draco_is_named_and_nothing_is_printed(tmp_path, caplog, capfd):

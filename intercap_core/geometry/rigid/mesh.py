@@ -371,6 +371,12 @@ def _contact_places(
     if listed is None:
         return None
     ids = read_contact_vertices(Path(listed), path, vertices)
+    if path.suffix.lower() == ".stl":
+        log.warning(
+            "%s: its numbers count the corners of all triangles of %s, because STL numbers no "
+            "vertices; use a .ply or .obj for a list that another program made",
+            listed, path,
+        )  # fmt: skip
     if np.array_equal(vertices, loaded, equal_nan=True):
         places = place[ids]
     else:

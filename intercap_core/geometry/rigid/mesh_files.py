@@ -55,7 +55,7 @@ def load_mesh(path: Path) -> Any:
         _refuse_extensions(path, content)
     try:
         if suffix == ".obj":
-            content = _absolute_indices(content)
+            content = _plain_obj(content)
         with warnings.catch_warnings(), _silent_trimesh():
             warnings.simplefilter("ignore")  # NumPy's, about values that are rejected later
             mesh: Any = trimesh.load(
@@ -186,20 +186,22 @@ def _refuse_extensions(path: Path, content: bytes) -> None:
         )
 
 
-def _absolute_indices(content: bytes) -> bytes:
-    """Replace relative (negative) indices of an OBJ's faces, which trimesh counts from the end.
+def _plain_obj(content: bytes) -> bytes:
+    """Rewrite vertices and faces of an OBJ file in the form that trimesh reads.
 
-    They count back from the vertices above the face. Raises ValueError for an index before the
-    first vertex.
+    Trimesh takes neither tabs, spaces before a line nor comments after its numbers, and counts
+    negative indices from the end of the file. They count back from the vertices above the face.
+    Raises ValueError for an index before the first vertex.
     """
     content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    if not re.search(rb"^\s*f\s[^\n#]*-\d", content, re.MULTILINE):
+    if not re.search(rb"^f\s[^\n#]*-\d|^[ \t]+[vf]|^[vf]\w?\s[^\n]*[\t#]", content, re.MULTILINE):
         return content
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
     for line in content.splitlines():
         words = line.partition(b"#")[0].split()
         if words and words[0] in counts:
             counts[words[0]] += 1
+            line = b" ".join(words)
         elif words[:1] == [b"f"]:
             corners = [corner.split(b"/") for corner in words[1:]]
             for corner in corners:
