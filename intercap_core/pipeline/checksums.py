@@ -201,6 +201,8 @@ def read_valid_manifest(output: Path) -> Manifest | None:
     UserError if the output cannot be read.
     """
     file = output if output.suffix == ".h5" else output / FILE
+    if file.exists() and not file.is_file():  # a pipe, whose reader waits
+        return None
     try:
         file.open("rb").close()
     except (FileNotFoundError, NotADirectoryError):

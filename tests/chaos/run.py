@@ -4,8 +4,10 @@ tests.chaos.run``.
 A small dataset is computed in peace. Copies of it are killed at a random moment of every stage of
 every sequence and while Snakemake plans, run out of disk, have their results damaged, and see the
 clock jump. After each, ``intercap run`` goes on; in the end every file must be the peaceful run's,
-byte for byte. Adds ``chaos.*`` to results/bench.json. Disks need a user who may mount a tmpfs, the
-clock libfaketime (Debian: faketime); where one is missing, that is said.
+byte for byte. So it must be after all files were dated ahead of the clock or behind it, and after
+files of exports, pages, tables and site were damaged, removed, or replaced by links, pipes and
+files that unpack to gigabytes. Adds ``chaos.*`` to results/bench.json. Disks need a user who may
+mount a tmpfs, the clock libfaketime (Debian: faketime); where one is missing, that is said.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from pathlib import Path
 
 from bench.command import add_figures
 from intercap_core.stage_list import SEQUENCE_STAGES
-from tests.chaos.victim import Victim, damage, identical, kill_after, kill_in
+from tests.chaos.victim import Victim, bomb, damage, identical, kill_after, kill_in, replace
 from tests.helpers.flow import Flow
 
 OUTPUT = Path("results/bench.json")
@@ -135,6 +137,55 @@ def clock_jumps(peaceful: Victim, victim: Victim) -> tuple[int, int]:
     return 2, 2 if all(same.values()) else 0
 
 
+def dates(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """All files of the user and of the results dated ahead of the clock, then behind it.
+
+    A damaged artefact makes jobs run. Returns the number of runs, and how many were identical.
+    """
+    shutil.copytree(peaceful.flow.results, victim.flow.results)
+    good = 0
+    for days in (2, -9):
+        damage(random.choice(sorted(victim.flow.results.glob("*/metrics.h5"))))
+        date = time.time() + days * DAY_S
+        for folder in (victim.flow.results, victim.flow.folder / "config"):
+            for path in folder.rglob("*"):
+                os.utime(path, (date, date))
+        print(f"all files dated {days:+d} days", flush=True)
+        _goes_on(victim)
+        same = identical(victim, peaceful)
+        _tell(same)
+        good += all(same.values())
+    return 2, good
+
+
+def deliverables(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+    """Files of exports, pages, tables, card and site, and artefacts, of which each is damaged,
+    replaced, or made to unpack to gigabytes; returns how many, and how many were made again."""
+    shutil.copytree(peaceful.flow.results, victim.flow.results)
+    results = victim.flow.results
+    patterns = ("*/export/**/*", "site/sequences/**/*", "site/*", "tables/*", "*.*", "*/*.h5")
+    chosen = {}
+    for pattern in patterns:
+        files = [
+            path
+            for path in sorted(results.glob(pattern))
+            if path.is_file() and not path.name.startswith(".") and path.stat().st_size
+        ]
+        for path, change in zip(
+            random.sample(files, min(3, len(files))), (damage, replace, damage), strict=False
+        ):
+            chosen[path] = change
+    for pattern in ("*/export/**/*.npz", "*/joint.h5"):
+        path = random.choice(sorted(results.glob(pattern)))
+        chosen[path] = bomb
+    for path, change in chosen.items():
+        print(f"{path.relative_to(results)}: {change(path)}", flush=True)
+    _goes_on(victim)
+    same = identical(victim, peaceful)
+    _tell(same)
+    return len(chosen), sum(same[path.relative_to(results).as_posix()] for path in chosen)
+
+
 def _goes_on(victim: Victim) -> None:
     status, said = victim.go_on()
     if status:
@@ -169,6 +220,8 @@ ROUNDS: dict[str, tuple[Round, str]] = {
     "kills": (killed, ""),
     "full_disks": (full_disk, "" if os.geteuid() == 0 else "no tmpfs can be mounted: not root"),
     "damaged": (damaged, ""),
+    "dates": (dates, ""),
+    "deliverables": (deliverables, ""),
     "clock_jumps": (clock_jumps, "" if FAKETIME.is_file() else f"no {FAKETIME}: install faketime"),
 }
 

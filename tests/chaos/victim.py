@@ -8,9 +8,11 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import psutil
 
 from intercap_core.pipeline.job import read_state
@@ -119,6 +121,33 @@ def kill_after(victim: Victim, seconds: float) -> None:
     run = victim.start()
     time.sleep(seconds)
     victim.kill(run)
+
+
+def replace(path: Path) -> str:
+    """Remove a file, or put a link or a pipe in its place; returns which, in words."""
+    path.unlink()
+    kind = random.choice(["removed", "a link to nothing", "a link to itself", "a pipe"])
+    if kind == "a link to nothing":
+        path.symlink_to("nowhere")
+    elif kind == "a link to itself":
+        path.symlink_to(path.name)
+    elif kind == "a pipe":
+        os.mkfifo(path)
+    return kind
+
+
+def bomb(path: Path) -> str:
+    """Put a small file in place of an output that unpacks to gigabytes; returns a description."""
+    if path.suffix == ".h5":
+        with h5py.File(path, "r+") as file:
+            key = next(key for key in file if isinstance(file[key], h5py.Dataset))
+            kind, rank = file[key].dtype, max(file[key].ndim, 1)
+            del file[key]
+            file.create_dataset(key, (1 << 40, *[1] * (rank - 1)), kind, chunks=True)
+        return f"2^40 rows in {key}"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("values.npy", bytes(1 << 28))
+    return "an archive of zeros"
 
 
 def damage(path: Path) -> str:

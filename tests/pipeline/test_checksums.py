@@ -158,6 +158,14 @@ def test_a_damaged_file_of_a_folder_is_named(
     assert read_valid_manifest(folder) is None
 
 
+@pytest.mark.parametrize("name", ["joint.h5", "export/.made_from.json"])
+def test_a_pipe_in_place_of_an_output_is_not_opened(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    os.mkfifo(path)
+    assert read_valid_manifest(path if path.suffix == ".h5" else path.parent) is None
+
+
 def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:
     results, unharmed = tmp_path / "results", tmp_path / "unharmed"
     results.mkdir()
