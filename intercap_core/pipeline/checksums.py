@@ -201,9 +201,9 @@ def read_valid_manifest(output: Path) -> Manifest | None:
     UserError if the output cannot be read.
     """
     file = output if output.suffix == ".h5" else output / FILE
-    if file.exists() and not file.is_file():  # a pipe, whose reader waits
-        return None
     try:
+        if not file.is_file():  # missing, a link to nothing, or a pipe, whose reader waits
+            return None
         file.open("rb").close()
     except (FileNotFoundError, NotADirectoryError):
         return None

@@ -164,7 +164,12 @@ class Plan:
         existing = self.project.results.is_dir()
         now = file_system_time(self.project.results) if existing else 0.0
         for name, stage in (*outputs, ("", DATASET)):
-            dated = self._dated_files(name, stage)
+            dated = []
+            for file in self._dated_files(name, stage):
+                if file.exists():
+                    dated.append(file)
+                elif file.is_symlink():  # to nothing or to itself, at which Snakemake fails
+                    file.unlink()
             for file in dated:
                 if file.stat().st_mtime > now:
                     os.utime(file)
@@ -180,14 +185,14 @@ class Plan:
                         break
 
     def _dated_files(self, sequence: str, stage: str) -> list[Path]:
-        """Existing files and folders whose date Snakemake may take for that of an output."""
+        """Files and folders whose date Snakemake may take for that of an output."""
         if stage == DATASET:
             paths = [self.project.results / name for name in DATASET_OUTPUTS]
         else:
             paths = [self.output(sequence, stage)]
         names = (".snakemake_timestamp", "capture.json", "truth.h5")
         paths += [path / name for path in paths if path.is_dir() for name in names]
-        return [path for path in paths if path.exists()]
+        return paths
 
     def _state(self, sequence: str, stage: str) -> OutputState:
         return self.dataset if stage == DATASET else self.states(sequence)[stage]

@@ -389,6 +389,19 @@ def test_marks_are_newer_where_dates_are_whole_seconds(
     assert mark.stat().st_mtime_ns == plan.output(ONE, "joint").stat().st_mtime_ns + 10**9
 
 
+@pytest.mark.parametrize("target", ["nowhere", "card.md", "joint.h5"])
+def test_an_output_that_is_a_link_to_nothing_is_missing(folder: Path, target: str) -> None:
+    """Snakemake fails at a link to itself."""
+    project = load_project(SETTINGS)
+    paths = (project.results / "card.md", project.artefact(ONE, "joint"))
+    for path in paths:
+        path.unlink()
+        path.symlink_to(target)
+    Plan(load_project(SETTINGS)).mark_all()
+    assert not any(path.is_symlink() and not path.exists() for path in paths)
+    assert _pending() >= _of(ONE, "joint") | DATASET
+
+
 @pytest.mark.parametrize("fault", ["cut", "missing", "whole output missing"])
 def test_a_release_refuses_damaged_and_incomplete_sequences(folder: Path, fault: str) -> None:
     project = load_project(SETTINGS)
