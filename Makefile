@@ -5,6 +5,7 @@
 # make test-slurm      the workflow on a real Slurm (Debian: slurm-wlm, munge; as root), with faults
 # make chaos           runs that are killed, disks that are full, results that are damaged
 # make fuzz            damaged files of every kind that a user supplies
+# make cases           files as people have them, from public bug reports
 # make lint            ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make mediapipe       environment of a real keypoint detector, for make evaluate
 # make evaluate        all evaluation recordings against truth, into results/evaluation.json
@@ -18,7 +19,7 @@
 # make scale-report    the site of 223 sequences of 300 frames
 # make docs            generated pages and schemas, and the rule graph
 #
-# Figures of bench, ablation, oracle, scale, chaos, fuzz and test-slurm go to results/*.json.
+# Figures of bench, ablation, oracle, scale, chaos, fuzz, cases and test-slurm go to results/*.json.
 PYTHON ?= python3
 VENV ?= .venv
 CORES ?= 0
@@ -30,7 +31,7 @@ EXTRAS := workflow,test,bench,dev
 RUN_TESTS = $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-fast test-all test-slurm lint ruff-check ruff-format imports snakefmt mypy \
-    snakemake-lint mediapipe evaluate evaluate-quick bench ablation oracle annotate-driven report scale-report scale fuzz chaos \
+    snakemake-lint mediapipe evaluate evaluate-quick bench ablation oracle annotate-driven report scale-report scale fuzz cases chaos \
     docs environment clean
 
 demo: $(STAMP)
@@ -116,6 +117,9 @@ scale: $(STAMP)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz.run
+
+cases: $(STAMP)
+	$(BIN)/python -m tests.cases.run
 
 chaos: $(STAMP)
 	$(BIN)/python -m tests.chaos.run
