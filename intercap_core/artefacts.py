@@ -335,7 +335,12 @@ class Artefact:
         self.attributes = {k: _value(v) for k, v in file.attrs.items() if k != MADE_FROM}
 
     def __contains__(self, key: str) -> bool:
-        return key in self._datasets or isinstance(self._file.get(key), h5py.Dataset)
+        if key in self._datasets or key not in self._file:
+            return key in self._datasets
+        try:
+            return isinstance(self._file[key], h5py.Dataset)
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise self._damaged(f"dataset {key!r} is damaged") from error
 
     def keys(self, prefix: str = "") -> list[str]:
         """Sorted names of the datasets that begin with ``prefix``."""

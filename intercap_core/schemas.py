@@ -493,7 +493,7 @@ METRICS = Schema(
         "object_sample_points": Field(("N", "3"), "float64", "points distributed evenly over the object's surface", "m", "object", optional=True),
         "object_sample_contact": Field(("N",), "int32", "number of frames in which the point faces the body within 4.5 mm", optional=True),
         "object_to_body": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the body's surface, negative inside, capped at 0.10, inside at -0.25", "m", optional=True),
-        "body_contact_distance": Field(("T", "V"), "float32", "signed distance of each body vertex to the part of the object's surface that it faces with nothing between, negative inside; 0.10 = faces none within 30 mm", "m", optional=True),
+        "body_contact_distance": Field(("T", "V"), "float32", "signed distance of each body vertex to the part of the object's surface that it faces with nothing between, negative inside; 0.10 = its nearest point within 30 mm is not faced, nor another within 10 mm", "m", optional=True),
         "object_contact_distance": Field(("T", "Vo"), "float32", "signed distance of each object vertex to the part of the body's surface that it faces with nothing between, negative inside; 0.10 = faces none within 4.5 mm", "m", optional=True),
         "contact_frame": Field(("T",), "bool", "a body vertex with a contact distance of at most 4.5 mm", optional=True),
         "region_names": Field(("R",), "str", "contact regions", optional=True),

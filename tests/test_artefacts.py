@@ -246,6 +246,25 @@ def test_rows_are_streamed(tmp_path: Path) -> None:
             source["cameras/k1"]
 
 
+def test_a_damaged_optional_dataset_is_not_an_absent_one(tmp_path: Path) -> None:
+    path = tmp_path / "trial.h5"
+    with artefacts.write(path, SCHEMA, sequence="s1") as writer:
+        writer.put("points", np.zeros((1, 1, 3)))
+        writer.put("good", [True])
+        writer.put("names", ["a"])
+        writer.put("cameras/k1/depth", np.zeros((2, 6, 8), np.uint16))
+    with h5py.File(path) as file:
+        header = h5py.h5o.get_info(file["cameras/k1/depth"].id).addr
+    content = bytearray(path.read_bytes())
+    content[header : header + 16] = b"\xff" * 16
+    path.write_bytes(content)
+    with (
+        pytest.raises(Unreadable, match="depth' is dam"),
+        artefacts.read(path, SCHEMA) as source,
+    ):
+        assert "cameras/k1/depth" in source
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.binary(max_size=40), max_size=12))
 def test_ragged_bytes_round_trip(items: list[bytes]) -> None:

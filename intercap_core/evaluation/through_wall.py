@@ -1,4 +1,4 @@
-"""Contact points behind a wall, by a ray cast that shares no code with the rule of contact.
+"""Contact points behind a wall, by a ray cast that does not use :func:`.facing.facing_distance`.
 
 A touched point of an object is behind a wall if every straight way from it to the body within the
 threshold crosses the object or is within it. A touched point inside the body is behind a wall if on

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import reprlib
 import stat
 from collections.abc import Iterator
@@ -111,12 +112,22 @@ def _named_below(folder: Path, content: bytes, above: tuple[Path, ...]) -> Itera
     """
     above = (*above, folder.resolve())
     for entry in os.scandir(folder):
-        name, path = os.fsencode(entry.name), folder / entry.name
-        if name in content or quote(name).encode() in content:
-            if not entry.is_dir():
+        path, name = folder / entry.name, os.fsencode(entry.name)
+        names = {name, quote(name).encode()}
+        if not entry.is_dir():
+            if any(name in content for name in names):
                 yield path
-            elif path.resolve() not in above:
-                yield from _named_below(path, content, above)
+        elif (
+            not name.isdigit()  # "1/" may be the numbers of a face
+            and any(_is_folder_in(content, name) for name in names)
+            and path.resolve() not in above
+        ):
+            yield from _named_below(path, content, above)
+
+
+def _is_folder_in(content: bytes, name: bytes) -> bool:
+    """Whether ``content`` has the name as a folder of a path."""
+    return bool(re.search(re.escape(name) + rb"[/\\]", content))
 
 
 def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:

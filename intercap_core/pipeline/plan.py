@@ -7,6 +7,7 @@ the stored ones is read through, and is stale if it is damaged. See docs/reruns.
 
 from __future__ import annotations
 
+import logging
 import os
 import uuid
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,8 @@ from intercap_core.pipeline.stage_inputs import (
 )
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
+
+log = logging.getLogger(__name__)
 
 DATASET = "dataset"
 MARKS = Path(".snakemake") / "out_of_date"
@@ -169,6 +172,7 @@ class Plan:
                 if file.exists():
                     dated.append(file)
                 elif file.is_symlink():  # to nothing or to itself, at which Snakemake fails
+                    log.warning("%s: removed, it was a link to %s", file, os.readlink(file))
                     file.unlink()
             for file in dated:
                 if file.stat().st_mtime > now:
@@ -273,6 +277,8 @@ def _find_fault(output: Path, sequence: str, stage: str) -> str:
     """Read an output; returns an error message if it is missing or damaged, otherwise ""."""
     if not output.exists():
         return f"{output}: is missing; run again"
+    if not (output.is_file() or output.is_dir()):
+        return f"{output}: is no file; run again"
     manifest = read_manifest(output)
     if manifest is not None and (manifest.sequence, manifest.stage) != (sequence, stage):
         made = f"{manifest.stage} of {manifest.sequence or 'all sequences'}"

@@ -23,7 +23,7 @@ from intercap_core.pipeline.checksums import (
     read_valid_manifest,
     remember_output,
 )
-from intercap_core.pipeline.provenance import Manifest, write_manifest
+from intercap_core.pipeline.provenance import Manifest, read_manifest, write_manifest
 
 WRITES = """
 import resource, sys
@@ -163,7 +163,8 @@ def test_a_pipe_in_place_of_an_output_is_not_opened(tmp_path: Path, name: str) -
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     os.mkfifo(path)
-    assert read_valid_manifest(path if path.suffix == ".h5" else path.parent) is None
+    output = path if path.suffix == ".h5" else path.parent
+    assert read_valid_manifest(output) is None and read_manifest(output) is None
 
 
 def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import yaml
 from intercap_core.commands.release import write_release
 from intercap_core.commands.status import print_status, print_verification
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import referenced_files
 from intercap_core.pipeline import checksums
 from intercap_core.pipeline.checksums import remember_output
 from intercap_core.pipeline.plan import OutputStatus, Plan, mark_of
@@ -300,10 +301,13 @@ def test_files_that_a_mesh_names_count(folder: Path) -> None:
     """Also through another file, in a folder, with an encoded name."""
     mesh = load_project(SETTINGS).objects["cup"].mesh
     (mesh.parent / "maps").mkdir()
+    (mesh.parent / "2").mkdir()  # of which a face, "2/1", says nothing
+    (mesh.parent / "2" / "1").write_text("frame 1")
     with mesh.open("ab") as file:
-        file.write(b"comment TextureFile red.mtl\n")
+        file.write(b"comment TextureFile red.mtl 2/1\n")
     (mesh.parent / "red.mtl").write_text("map_Kd maps\\red%20one.png\n")
     texture = mesh.parent / "maps" / "red one.png"
+    assert mesh.parent / "2/1" not in referenced_files(mesh)
     for content in ("red", "blue"):
         texture.write_text(content)
         (reason,) = [
@@ -390,7 +394,9 @@ def test_marks_are_newer_where_dates_are_whole_seconds(
 
 
 @pytest.mark.parametrize("target", ["nowhere", "card.md", "joint.h5"])
-def test_an_output_that_is_a_link_to_nothing_is_missing(folder: Path, target: str) -> None:
+def test_an_output_that_is_a_link_to_nothing_is_missing(
+    folder: Path, target: str, caplog: pytest.LogCaptureFixture
+) -> None:
     """Snakemake fails at a link to itself."""
     project = load_project(SETTINGS)
     paths = (project.results / "card.md", project.artefact(ONE, "joint"))
@@ -399,6 +405,7 @@ def test_an_output_that_is_a_link_to_nothing_is_missing(folder: Path, target: st
         path.symlink_to(target)
     Plan(load_project(SETTINGS)).mark_all()
     assert not any(path.is_symlink() and not path.exists() for path in paths)
+    assert caplog.text.count(f"removed, it was a link to {target}") == 2
     assert _pending() >= _of(ONE, "joint") | DATASET
 
 
