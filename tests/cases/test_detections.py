@@ -190,6 +190,15 @@ def test_ids_of_a_data_set_that_count_from_1(tmp_path):
     assert any("numbered from 1" in note for note in found.notes)
 
 
+def test_numbers_beyond_the_last_image_do_not_move_those_that_begin_later(tmp_path):
+    entries = [{"image_id": n, "keypoints": person_of("coco")} for n in range(2, 7)]
+    (tmp_path / "k1.json").write_text(json.dumps(entries))
+    found = read(tmp_path, camera(6))
+    assert [n for n, people in found.by_image.items() if len(people)] == [2, 3, 4, 5]
+    (note,) = found.notes
+    assert "1 results in" in note and note.endswith("image numbers count from 0")
+
+
 def test_keypoints_are_scaled_from_the_stated_size_or_from_shares(tmp_path):
     point = np.reshape(person_of("coco"), (17, 3))
     forms = {

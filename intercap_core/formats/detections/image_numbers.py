@@ -95,8 +95,9 @@ class CameraImages:
         """Image number of each number of the detections, and a remark on how they count.
 
         None in place of the image numbers if the numbers fit no image or some of them do not.
-        Hypotheses in order: the stated first number; image numbers from 0; from 1, if one of them
-        is beyond the last image; from any number, or times, if there is one for each image.
+        Hypotheses in order: the stated first number; image numbers from 0; from 1, if the numbers
+        begin at 1 and end beyond the last image; from any number, or times, if there is one for
+        each image.
         """
         first, given = min(self.recorded, default=0), sorted(set(numbers))
         if not given or not self.recorded:
@@ -108,7 +109,8 @@ class CameraImages:
         if first != 0 or len(self.recorded) <= max(self.recorded):
             return None, ""  # the images have numbers of their own
         share = len(given) / len(self.recorded)
-        if share >= MIN_SHARE_SHIFTED and self.recorded.issuperset(n - 1 for n in given):
+        begins_at_1 = given[0] == 1 and self.recorded.issuperset(n - 1 for n in given)
+        if share >= MIN_SHARE_SHIFTED and begins_at_1:
             return {n: int(n) - 1 for n in given}, "numbered from 1"
         images = sorted(self.recorded)
         if len(given) == len(images):
