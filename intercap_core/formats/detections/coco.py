@@ -19,7 +19,12 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from intercap_core.formats.detections.class_names import check_label, parse_class_names
-from intercap_core.formats.detections.instance import Instance, make_instance, to_rle
+from intercap_core.formats.detections.instance import (
+    Instance,
+    are_polygons_shares,
+    make_instance,
+    to_rle,
+)
 from intercap_core.inputs.documents import json_decoder, parse_json
 from intercap_core.inputs.files import UnreadableFile, quoted, read_bytes
 
@@ -93,7 +98,7 @@ class CandidateForm:
 
 @dataclass(frozen=True)
 class _FileHead:
-    """What a data set states about all of its entries."""
+    """Facts that hold for all entries of a file."""
 
     names: Mapping[int, str]
     """Classes by number."""
@@ -103,6 +108,8 @@ class _FileHead:
     """Size of all images."""
     corners: bool
     """Whether boxes are x, y of two opposite corners; otherwise x, y, width, height."""
+    shares: bool = False
+    """Whether corners of polygons are shares of the image's width and height."""
 
 
 def parse_candidates(
@@ -128,6 +135,8 @@ def parse_candidates(
         raise UnreadableDetections(
             f"holds {quoted(content)}, expected a list of results, or 'annotations' with one"
         )
+    segmentations = (_segmentation(entry) for entry in entries if isinstance(entry, dict))
+    head = replace(head, shares=are_polygons_shares(segmentations))
     result = CandidateFile(images=images)
     for index, entry in enumerate(entries):
         image = ImageKey(None, None)
@@ -274,8 +283,8 @@ def _instance(
 ) -> tuple[Instance, tuple[float, float]]:
     """The instance of an entry, and the factors by which its mask was scaled."""
     label = _label(entry, head.names)
-    segmentation = entry.get("segmentation", entry.get("segments"))
-    rle, factors = to_rle(segmentation, size, image.size or head.size)
+    stated = image.size or head.size
+    rle, factors = to_rle(_segmentation(entry), size, stated, shares=head.shares)
     instance = make_instance(label, score, rle, size)
     if instance is None:
         raise ValueError("its mask is empty")
@@ -300,6 +309,10 @@ def _instance(
             f"bbox is {quoted(box)}, expected pixels of the image of {size[0]}x{size[1]}"
         )
     return (replace(instance, box=(x, y, w, h)) if w and h else instance), factors
+
+
+def _segmentation(entry: dict[str, Any]) -> Any:
+    return entry.get("segmentation", entry.get("segments"))
 
 
 def _score(entry: dict[str, Any]) -> float:

@@ -6,6 +6,7 @@ another resolution is scaled. A mask of another aspect ratio is refused: it is o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,11 +68,32 @@ def scale_to(own: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]
 
 
 def are_shares(coordinates: np.ndarray) -> bool:
-    """Whether coordinates (N,) of one shape are shares of the image's width and height.
+    """Whether coordinates (N,) of one or more shapes are shares of the image's width and height.
 
     No person and no object that is used lies within the first two pixels of an image.
     """
     return coordinates.size > 0 and bool((np.abs(coordinates) <= MAX_SHARE).all())
+
+
+def are_polygons_shares(segmentations: Iterable[Any]) -> bool:
+    """Whether the corners of all polygons among a file's segmentations are shares.
+
+    Whole numbers alone are pixels: a few pixels in the corner of the image, as ``findContours``
+    outlines them. Polygons that are no finite numbers, and RLEs, are skipped.
+    """
+    is_any_fractional = False
+    for segmentation in segmentations:
+        for polygon in _polygons(segmentation) or ():
+            try:
+                corners = np.array(_numbers(polygon))
+            except ValueError:
+                continue
+            if not corners.size or not np.isfinite(corners).all():
+                continue
+            if not are_shares(corners):
+                return False
+            is_any_fractional |= bool((corners % 1 != 0).any())
+    return is_any_fractional
 
 
 def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -81,7 +103,11 @@ def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def to_rle(
-    segmentation: Any, size: tuple[int, int], stated: tuple[int, int] | None = None
+    segmentation: Any,
+    size: tuple[int, int],
+    stated: tuple[int, int] | None = None,
+    *,
+    shares: bool = False,
 ) -> tuple[bytes, tuple[float, float]]:
     """Compressed RLE of a segmentation, and the factors (x, y) by which the mask was scaled.
 
@@ -91,18 +117,19 @@ def to_rle(
         segmentation: an RLE with size and counts (compressed, also as the text of Python's bytes;
             or a list of lengths), polygons, one flat polygon, or lists ``x`` and ``y`` of corners.
         size: width and height of the result.
-        stated: size of the image according to the file.
+        stated: size of the image according to the file. An RLE states its own size.
+        shares: corners of polygons are shares of the image's width and height.
     """
-    factors = scale_to(stated, size) if stated is not None else (1.0, 1.0)
     if isinstance(segmentation, dict) and "counts" in segmentation:
         return _from_rle(segmentation, size)
     given = _polygons(segmentation)
     if given is None:
         raise ValueError("has no segmentation; expected an RLE with size and counts, or polygons")
     polygons = [_numbers(polygon) for polygon in given]
-    x, y = factors
-    if are_shares(np.array([v for polygon in polygons for v in polygon])):
-        x, y = size
+    if shares:
+        x, y = map(float, size)
+    else:
+        x, y = scale_to(stated, size) if stated is not None else (1.0, 1.0)
     scaled = [[v * (y if i % 2 else x) for i, v in enumerate(polygon)] for polygon in polygons]
     return masks.from_polygons(scaled, size[1], size[0]), (x, y)
 

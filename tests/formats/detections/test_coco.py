@@ -188,6 +188,26 @@ def test_masks_of_a_reduced_copy_are_scaled(tmp_path):
     np.testing.assert_array_equal(masks.decode(instances(result, 7)[0].rle, HEIGHT, WIDTH), MASK)
 
 
+def test_the_size_that_a_file_states_for_an_image_is_not_that_of_an_rle(tmp_path):
+    content = {"images": [{"id": 7, "width": 50, "height": 50}], "annotations": [ENTRY]}
+    result = read(tmp_path, content)
+    assert not result.faults
+    np.testing.assert_array_equal(masks.decode(instances(result, 7)[0].rle, HEIGHT, WIDTH), MASK)
+
+
+def test_small_polygons_in_the_corner_are_pixels_unless_all_polygons_are_shares(tmp_path):
+    corner, smooth, whole = [0, 0, 1, 0, 1, 1, 0, 1], [0.5, 0, 1.5, 0, 1.5, 2], [1, 1, 9, 1, 9, 9]
+    share = [0.5, 0.5, 1, 0.5, 1, 1, 0.5, 1]
+    for polygons, shares in (
+        ([corner], 0),
+        ([smooth, whole], 0),
+        ([corner, share], 2),
+        ([share, [float("nan")] * 6], 1),
+    ):
+        result = read(tmp_path, [ENTRY | {"segmentation": [polygon]} for polygon in polygons])
+        assert result.shares == shares, polygons
+
+
 CORNERS = [10, 4, 22, 9]
 RLE_TEXT = {"size": SIZE, "counts": RLE.decode()}
 
