@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,12 @@ from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.formats.detections.keypoints import layouts, read_people
+from intercap_core.formats.detections.keypoints import (
+    compare_bones,
+    layouts,
+    read_people,
+    to_shared,
+)
 from intercap_core.formats.detections.mask_files import MaskFile, read_masks
 from tests.cases import SEQUENCE, check, open_case
 
@@ -138,6 +144,15 @@ def test_doubt_about_the_layout_is_noted_once(tmp_path):
     assert len(notes) == 1
 
 
+def test_bones_of_many_people_are_compared_in_little_memory():
+    person = to_shared(np.reshape(person_of("body_25"), (25, 3)), layouts()["body_25"].points)
+    tracemalloc.start()
+    share = compare_bones(np.broadcast_to(person, (20_000, *person.shape)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert share == compare_bones(person[None]) and peak < 100e6
+
+
 def test_points_in_an_unknown_order_are_refused_unless_a_layout_is_stated(tmp_path):
     order = np.random.default_rng(1).permutation(26)
     shuffled = np.reshape(person_of("halpe26"), (26, 3))[order].ravel().tolist()
@@ -253,9 +268,15 @@ def test_instances_of_palettes_colours_and_alpha(tmp_path):
     cv2.imwrite(str(tmp_path / "cut.png"), cut.astype(np.uint8))
     smooth = cv2.GaussianBlur(colours * np.uint8(numbers == 1)[..., None], (5, 5), 0)
     cv2.imwrite(str(tmp_path / "smooth.png"), smooth)
+    half = np.zeros((240, 320, 3), np.uint8)
+    half[numbers == 1] = (0, 0, 128)
+    cv2.imwrite(str(tmp_path / "half.png"), cv2.GaussianBlur(half, (5, 5), 0))
+    half[numbers == 1], half[numbers == 2] = (0, 0, 64), (0, 0, 128)  # classes of VOC
+    cv2.imwrite(str(tmp_path / "dark.png"), half)
     first, second = (30, 20, 60, 40), (200, 100, 60, 50)
     for name, boxes in (("palette", {first, second}), ("colours", {first, second}),
-                        ("cut", {first}), ("smooth", {first})):  # fmt: skip
+                        ("cut", {first}), ("smooth", {first}), ("half", {first}),
+                        ("dark", {first, second})):  # fmt: skip
         found = read_masks(MaskFile(tmp_path / f"{name}.png", "", numbered=True), SIZE)
         assert {instance.box for instance in found} == boxes, name
 

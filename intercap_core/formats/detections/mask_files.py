@@ -30,6 +30,8 @@ from intercap_core.inputs.files import printable
 BEHAVE_PERSON = ("person_mask",)
 BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second is used if the first is missing
 
+SMOOTH_WIDTH = 5  # px, largest width of the smooth outline of a mask
+
 
 class MaskFile(NamedTuple):
     """One file of masks of one image."""
@@ -96,8 +98,20 @@ def _decode(content: bytes, numbered: bool) -> np.ndarray:
     brightest = colours.reshape(-1, 3)[colours.sum(-1, dtype=int).argmax()].astype(float)
     shade = brightest * (level / max(brightest.max(), 1))[..., None]
     if np.abs(colours - shade).max() < 4:  # one colour, whose outline may be smooth
+        if np.ptp(brightest) and _is_smooth(level):
+            return np.where(level >= brightest.max() / 2, 255, 0).astype(np.uint8)
         return level
     return colours.astype(np.int64) @ (1, 1 << 16, 1 << 32)
+
+
+def _is_smooth(level: np.ndarray) -> bool:
+    """Whether levels (H, W) are of one mask with a smooth outline, not the numbers of instances.
+
+    Most pixels of the mask have the highest level, and the others are near them.
+    """
+    inner = (level == level.max()).astype(np.uint8)
+    near = cv2.dilate(inner, np.ones((2 * SMOOTH_WIDTH + 1, 2 * SMOOTH_WIDTH + 1), np.uint8))
+    return 2 * inner.sum() > np.count_nonzero(level) and bool(near[level > 0].all())
 
 
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:

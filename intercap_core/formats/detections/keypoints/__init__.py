@@ -159,6 +159,7 @@ _BONES = [
     ("nose", "left_eye"), ("nose", "right_eye"), ("left_hip", "right_hip"),
     ("mid_hip", "left_hip"), ("mid_hip", "right_hip"),
 ]  # fmt: skip
+MAX_COMPARED = 2000  # people of a camera; one takes 30 kB at the peak (tracemalloc, 20,000 people)
 BONE_QUANTILE = 0.75  # a point that is far off spoils the few bones that end in it
 _BONE_ENDS = np.array([[KEYPOINT_INDEX[end] for end in bone] for bone in _BONES])
 
@@ -172,8 +173,8 @@ def visible(points: np.ndarray) -> np.ndarray:
 def compare_bones(people: np.ndarray) -> float | None:
     """Length of long bones (upper quartile) as a share of the median distance of two body points.
 
-    A wrong layout joins points at random, so its share is near 1. Returns the median over people;
-    None if nobody has enough points.
+    A wrong layout joins points at random, so its share is near 1. Returns the median over
+    people, of whom ``MAX_COMPARED`` are compared; None if nobody has enough points.
 
     Args:
         people: keypoints (P, 135, 3) in the shared order.
@@ -185,6 +186,8 @@ def compare_bones(people: np.ndarray) -> float | None:
     points = points[extent.min(-1) > 0.02 * extent.max(-1)]  # points on a line show no bones
     if not len(points):
         return None
+    if len(points) > MAX_COMPARED:
+        points = points[np.linspace(0, len(points) - 1, MAX_COMPARED).astype(int)]
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
     first, second = np.triu_indices(points.shape[1], 1)
     bones = apart[:, _BONE_ENDS[:, 0], _BONE_ENDS[:, 1]]
