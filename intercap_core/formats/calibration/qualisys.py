@@ -9,6 +9,7 @@ k2, p1, p2: they agree with those that OpenCV finds for the cameras of Pose2Sim'
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -67,7 +68,8 @@ def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibra
 def _parse(path: Path) -> ElementTree.Element:
     try:
         content = read_bytes(path, MAX_CALIBRATION_BYTES)
-        if b"<!" in content:
+        # Without the zeros of UTF-16. Comments and CDATA also begin with "<!".
+        if re.search(rb"<!\s*(DOCTYPE|ENTITY)", content.replace(b"\0", b"")):
             raise UserError(f"{path}: declares a document type or entities; remove them")
         return ElementTree.fromstring(content)
     except UnreadableFile as error:

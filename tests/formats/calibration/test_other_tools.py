@@ -238,6 +238,11 @@ def twice(path: Path) -> None:
     (path / "images.txt").write_text("\n".join([*lines, " ".join(words), ""]))
 
 
+def as_utf16_with_document_type(path: Path) -> None:
+    text = path.read_text().replace("ASCII", "UTF-16")
+    path.write_text(text.replace("<calibration>", "<!DOCTYPE a><calibration>"), encoding="utf-16")
+
+
 FAULTS = [
     ("pose2sim", edit("fisheye = false", "fisheye = true"), "camera 'left': is calibrated as a fi"),
     ("pose2sim", edit("translation", "shift"), "camera 'left': has no translation"),
@@ -259,6 +264,8 @@ FAULTS = [
         edit("<calibration>", "<!DOCTYPE a><calibration>"),
         "declares a document type",
     ),
+    ("qualisys", as_utf16_with_document_type, "declares a document type"),
+    ("qualisys", edit("<calibration>", "<calibration><!-- by hand --><![CDATA[ ]]>"), None),
     ("qualisys", edit('z="', 'height="'), "camera 'left': transform has"),
     (
         "qualisys",
