@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import class_names
+from intercap_core.formats.detections.coco import LARGEST_ID
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.recordings.extract import advice_on_size
 from intercap_core.formats.recordings.image_files import FilesRecording
@@ -88,10 +90,13 @@ class RecordingFindings:
             if whole.stat().st_size > 64 << 20:  # would take more than 0.5 s
                 return
             content = whole.read_bytes()
-            ids, names = ({v.strip(b'"') for v in form.findall(content)} for form in _IMAGE_IDS)
+            ids, names = ({_parse(v) for v in form.findall(content)} for form in _IMAGE_IDS)
             count = len(ids or names)
-            _, remark = images.match_numbers({int(v) for v in ids if v.isdigit()})
-            self.add_recognised(kind, [f"images {remark}"] if remark else [])
+            texts = [v for v in ids | names if isinstance(v, str)]
+            numbers = {v for v in ids if isinstance(v, int) and 0 <= v <= LARGEST_ID}
+            _, _, remark = images.match_keys(texts, numbers)
+            if recorded and remark:
+                self.add_recognised(kind, [f"images {remark}"])
         if not recorded or not count:
             return
         cover = f"{folder}: {kind} of camera {images.name} cover {count}"
@@ -102,6 +107,15 @@ class RecordingFindings:
                 f"{cover} images, it has {recorded}; they may belong to another recording, or the "
                 "recording is cut off"
             )
+
+
+def _parse(value: bytes) -> int | str | None:
+    """A number or text of JSON; None for any other value."""
+    try:
+        parsed = json.loads(value)
+    except (ValueError, RecursionError):
+        return None
+    return parsed if type(parsed) in (int, str) else None
 
 
 def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:

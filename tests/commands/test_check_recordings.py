@@ -142,6 +142,17 @@ def test_summary_of_a_good_sequence(images: SequenceEntry) -> None:
     )
 
 
+def test_ids_do_not_count_if_images_are_matched_by_name(images: SequenceEntry) -> None:
+    results = [{"image_id": n + 1, "file_name": f"{n:05d}.jpg"} for n in range(COUNT)]
+    for name in CAMERAS:
+        (images.candidates / f"{name}.json").write_text(json.dumps(results))
+    assert not look(images).recognised.get("candidates")
+    for entry in results:
+        del entry["file_name"]
+    (images.candidates / f"{CAMERAS[0]}.json").write_text(json.dumps(results))
+    assert look(images).recognised["candidates"] == {"images numbered from 1"}
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv", ".ts"])
 def test_a_video_cut_to_a_tenth_is_a_problem(tmp_path: Path, suffix: str) -> None:
     row = videos(tmp_path, suffix)

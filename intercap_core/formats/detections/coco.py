@@ -33,7 +33,7 @@ Result = TypeVar("Result")
 MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
 HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
 MAX_SCORE = 1.2  # the overlaps that Segment Anything predicts slightly exceed 1
-_LARGEST_ID = 2**31 - 1
+LARGEST_ID = 2**31 - 1
 
 
 class UnreadableDetections(Exception):
@@ -230,7 +230,7 @@ def read_listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
         raise UnreadableDetections("'images' must be a list of objects with id")
     for value in values:
         number = value.get("id") if isinstance(value, dict) else None
-        if type(number) is not int or not 0 <= number <= _LARGEST_ID:
+        if type(number) is not int or not 0 <= number <= LARGEST_ID:
             raise UnreadableDetections(f"'images' must list objects with id, found {quoted(value)}")
         name = value.get("file_name")
         size = _size(value.get("width"), value.get("height"))
@@ -269,7 +269,7 @@ def image_of(
     if value is None and (one_image or name is not None):
         known = listed.get(name) if name is not None else None
         return ImageKey(None, name, None if known is None else known.size)
-    if type(value) is not int or not 0 <= value <= _LARGEST_ID:
+    if type(value) is not int or not 0 <= value <= LARGEST_ID:
         raise ValueError(
             "image_id must be the whole number of a colour image from 0, or its file's name, "
             f"found {quoted(value)}"

@@ -65,18 +65,15 @@ class CameraImages:
         """Frame sets with an image."""
         return np.flatnonzero(self.number >= 0).tolist()
 
-    def match_names(self, names: Iterable[str]) -> dict[str, int]:
+    def recognise_names(self, names: Iterable[str]) -> tuple[dict[str, int], str]:
         """Numbers of the images that names of files refer to; other names are left out.
 
         If any name is that of an image file, only names of image files are matched. Otherwise a
         number in the names counts (``frame_0012_k1.jpg`` is image 12): the last one that differs
         in all names and that :meth:`match_numbers` recognises, otherwise the last one. If two names
-        end in the same number and no other number differs, the result is empty.
+        end in the same number and no other number differs, the result is empty. The second value
+        is a remark on how the names are numbered, "" = from 0.
         """
-        return self.recognise_names(names)[0]
-
-    def recognise_names(self, names: Iterable[str]) -> tuple[dict[str, int], str]:
-        """As :meth:`match_names`, with a remark on how the names are numbered, "" = from 0."""
         stems = {name: strip_suffix(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
         named = {name: places[stem] for name, stem in stems.items() if stem in places}
@@ -90,6 +87,22 @@ class CameraImages:
                 return {name: numbers[value] for name, value in field.items()}, remark
         last = {name: int(value) for name, value in fields[0].items()} if fields else {}
         return last, self.remark_on_start(last.values())
+
+    def match_keys(
+        self, names: Iterable[str], ids: Collection[int]
+    ) -> tuple[dict[str, int], dict[float, int], str]:
+        """Image numbers of the names and of the ids in one file, and a remark on their numbering.
+
+        Names count before ids. There are no image numbers of names if the ids fit more images.
+        """
+        by_name, remark = self.recognise_names(names)
+        matched, remark_on_ids = self.match_numbers(ids)
+        by_id = matched or {}
+        known_ids = self.recorded.intersection(by_id.get(n, n) for n in ids)
+        known_names = self.recorded.intersection(by_name.values())
+        if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
+            by_name = {}  # the numbers in the names are something else
+        return by_name, by_id, remark if by_name else remark_on_ids or self.remark_on_start(ids)
 
     def match_numbers(self, numbers: Collection[float]) -> tuple[dict[float, int] | None, str]:
         """Image number of each number of the detections, and a remark on how they count.
@@ -258,15 +271,10 @@ def sort_by_image(
     - all images, if the file has no such list and none of its entries can be used.
     """
     keys = [*(key for key, _ in file.results), *file.faulty, *(file.images or ())]
-    by_name, remark = images.recognise_names(key.name for key in keys if key.name is not None)
-    ids = {key.number for key in keys if key.number is not None}
-    by_id, remark_on_ids = images.match_numbers(ids)
-    by_id = by_id or {}
-    known_ids = images.recorded.intersection(by_id.get(n, n) for n in ids)
-    known_names = images.recorded.intersection(by_name.values())
-    if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
-        by_name = {}  # the numbers in the names are something else
-    remark = remark if by_name else remark_on_ids or images.remark_on_start(ids)
+    by_name, by_id, remark = images.match_keys(
+        (key.name for key in keys if key.name is not None),
+        {key.number for key in keys if key.number is not None},
+    )
 
     def number(key: ImageKey) -> int | None:
         if key.name is not None and (by_name or key.number is None):
