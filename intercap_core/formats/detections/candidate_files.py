@@ -14,6 +14,7 @@ from pathlib import Path
 from intercap_core.formats.detections.coco import (
     CandidateFile,
     CandidateForm,
+    DetectionPreview,
     UnreadableDetections,
     parse_candidates,
     read_head,
@@ -48,18 +49,6 @@ class CandidatesByImage:
     """Instances by image number; an empty list if the detector found none in the image."""
     notes: list[str] = field(default_factory=list)
     """Messages for the user about entries and files that were left out."""
-
-
-@dataclass
-class CandidatePreview:
-    """The beginning of one camera's candidates."""
-
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user about faults."""
-    labels: set[str] = field(default_factory=set)
-    """Labels of the instances."""
-    recognised: list[str] = field(default_factory=list)
-    """What was recognised by the content."""
 
 
 def camera_file(folder: Path, camera: str) -> Path | None:
@@ -230,7 +219,7 @@ def add_masks(
 
 def preview_candidates(
     folder: Path, images: CameraImages, *, names: Mapping[int, str]
-) -> CandidatePreview:
+) -> DetectionPreview:
     """Read the beginning of one camera's file, or the first of its files of one image.
 
     Masks as image files are not read.
@@ -240,7 +229,7 @@ def preview_candidates(
         images: the camera's images.
         names: classes by number.
     """
-    preview = CandidatePreview()
+    preview = DetectionPreview()
     size = images.size
     whole = camera_file(folder, images.name)
     files = image_files(folder, images.name)

@@ -81,6 +81,18 @@ class DetectionFile(Generic[Result]):
         self.faulty.append(image)
 
 
+@dataclass
+class DetectionPreview:
+    """The first keypoints or candidates of one camera."""
+
+    notes: list[str] = field(default_factory=list)
+    """Messages for the user about faults."""
+    labels: set[str] = field(default_factory=set)
+    """Labels of the instances; empty for keypoints."""
+    recognised: list[str] = field(default_factory=list)
+    """What was recognised by the content."""
+
+
 CandidateFile = DetectionFile[Instance]
 
 

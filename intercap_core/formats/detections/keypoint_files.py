@@ -16,7 +16,12 @@ import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.coco import UnreadableDetections, read_head, read_json
+from intercap_core.formats.detections.coco import (
+    DetectionPreview,
+    UnreadableDetections,
+    read_head,
+    read_json,
+)
 from intercap_core.formats.detections.image_numbers import (
     CameraImages,
     find_repeated_number,
@@ -412,19 +417,9 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
         reading.notes.append(f"no keypoint file for {missing} images")
 
 
-@dataclass
-class KeypointPreview:
-    """Some keypoints of one camera."""
-
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user about faults."""
-    recognised: list[str] = field(default_factory=list)
-    """What was recognised by the content."""
-
-
 def preview_keypoints(
     folder: Path, images: CameraImages, *, full_confidence: float, layout: str | None = None
-) -> KeypointPreview:
+) -> DetectionPreview:
     """Read the beginning of one camera's file, or some of its files of one image.
 
     Args:
@@ -433,7 +428,7 @@ def preview_keypoints(
         full_confidence: confidence that counts as 1.
         layout: name of the layout of the points, None = recognised.
     """
-    preview = KeypointPreview()
+    preview = DetectionPreview()
     whole = find_camera_file(folder, images.name)
     single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
     if whole is not None:
