@@ -78,7 +78,7 @@ FRAMES = Schema(
         "colour_index": Field(("T", "C"), "int32", "index in cameras/<c>/colour of the set's image, -1 = none"),
         "depth_index": Field(("T", "C"), "int32", "index in cameras/<c>/depth of the set's image, -1 = none"),
         "skew": Field(("T", "C"), "float32", "device time minus the set's time; NaN = no image", "s"),
-        "cameras/{camera}/colour": Field(("B",), "uint8", "JPEG or PNG files as recorded, concatenated", codec="none"),
+        "cameras/{camera}/colour": Field(("B",), "uint8", "JPEG or PNG files as recorded, concatenated; no set refers to a damaged one", codec="none"),
         "cameras/{camera}/colour_offsets": Field(("N+1",), "int64", "offset of each file, and the end"),
         "cameras/{camera}/colour_time": Field(("N",), "int64", "device time of each colour image", "us"),
         "cameras/{camera}/depth": Field(("D", "H", "W"), "uint16", "depth as recorded, 0 = invalid", "mm", "depth camera", codec="depth"),

@@ -172,7 +172,7 @@ def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
     """If a device's clock was reset, keep only the epoch that overlaps the other cameras in
     time."""
     present = [view for view in views if view.present]
-    epochs = {view.name: split_into_epochs(view.colour_times) for view in present}
+    epochs = {view.name: split_into_epochs(view.usable_times) for view in present}
     straight = [view for view in present if epochs[view.name].max() == 0]
     if not straight:
         first = views[master] if views[master].present else present[0]
@@ -188,11 +188,11 @@ def _keep_one_epoch(view: ExtractedCamera, epoch: np.ndarray, reference_us: np.n
     """Mark images outside the best epoch as unusable.
 
     Args:
-        epoch: epoch of each colour image, from 0; OUTLIER = time out of order.
+        epoch: epoch of each usable colour image, from 0; OUTLIER = time out of order.
         reference_us: device times of the other cameras' images.
     """
     period_us = 1e6 / view.fps
-    kept = choose_epoch(view.colour_times, epoch, np.sort(reference_us), period_us)
+    kept = choose_epoch(view.usable_times, epoch, np.sort(reference_us), period_us)
     resets = int(epoch.max())
     wrong = int((epoch == OUTLIER).sum())
     if wrong:
@@ -203,7 +203,7 @@ def _keep_one_epoch(view: ExtractedCamera, epoch: np.ndarray, reference_us: np.n
             f"its device times jump back {resets} times: {others} images outside the stretch of "
             f"{int((epoch == kept).sum())} in the other cameras' time left out"
         )
-    view.colour_usable &= epoch == kept
+    view.colour_usable[view.colour_usable] = epoch == kept
     if not len(view.depth_times):
         return
     depth = split_into_epochs(view.depth_times)

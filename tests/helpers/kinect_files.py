@@ -58,6 +58,7 @@ def record(
     serial: str = "",
     times_us=None,
     image_of=depth_at,
+    jpeg_of=jpeg_at,
 ) -> None:
     """Record ``ticks``; ``times_us`` maps a tick to device time if that is not a whole period."""
     device = make_camera(camera)
@@ -77,7 +78,7 @@ def record(
     ) as writer:
         for tick in ticks:
             time_us = times_us(tick) + 160 * camera
-            writer.write_colour(jpeg_at(camera, tick), time_us)
+            writer.write_colour(jpeg_of(camera, tick), time_us)
             writer.write_imu([0, 0, -9.8], [0, 0, 0], time_us)
             if depth:
                 writer.write_depth(image_of(camera, tick), time_us + DEPTH_DELAY_US)

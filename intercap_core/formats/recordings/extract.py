@@ -138,6 +138,7 @@ class _Copy:
         )
         self.colour_size = (recording.camera.colour.width, recording.camera.colour.height)
         self.colour_times: list[int] = []
+        self.usable: list[bool] = []  # whether the colour image is whole and of the right size
         self.depth_times: list[int] = []
         self.offsets, self.buffer = [0], bytearray()
         self.measured = False  # whether any depth image holds a distance
@@ -156,7 +157,7 @@ class _Copy:
                 (self._take_colour if image.kind == "colour" else self._take_depth)(image)
                 progress.step()
         except UserError as error:
-            if not self.colour_times:
+            if not any(self.usable):
                 raise
             view.truncated = True
             view.notes.append(f"read up to image {len(self.colour_times)}: {error}")
@@ -168,18 +169,17 @@ class _Copy:
         self._note_images()
 
     def _take_colour(self, image: Image) -> None:
-        """Copy a colour image; count one that is damaged or of another size."""
+        """Copy a colour image; count one that is damaged or of another size.
+
+        Those are copied too, but not usable, because detectors number all recorded images.
+        """
         content = bytes(image.content)
         size = encoded_size(content)
-        if size != self.colour_size:
-            if size is None:
-                self.damaged += 1
-                return
-            self._refuse("colour", size, self.colour_size, not self.colour_times)
-            return
-        if not holds_all_pixels(content):
-            self.damaged += 1
-            return
+        if size is not None and size != self.colour_size:
+            self._refuse("colour", size, self.colour_size, not any(self.usable))
+        whole = size is not None and holds_all_pixels(content)
+        self.damaged += not whole
+        self.usable.append(whole and size == self.colour_size)
         self.colour_times.append(image.time_us)
         self.offsets.append(self.offsets[-1] + len(content))
         # The end is entropy-coded data, which no two images share.
@@ -223,7 +223,7 @@ class _Copy:
         self._flush()
         view.colour_times = np.array(self.colour_times, np.int64)
         view.depth_times = np.array(self.depth_times, np.int64)
-        view.colour_usable = np.ones(len(self.colour_times), bool)
+        view.colour_usable = np.array(self.usable, bool)
         view.depth_usable = np.full(len(self.depth_times), self.measured)
         self.writer.put(f"{self.group}/colour_offsets", self.offsets)
         self.writer.put(f"{self.group}/colour_time", view.colour_times)
@@ -233,7 +233,7 @@ class _Copy:
     def _note_images(self) -> None:
         """Note what was left out; a camera whose depth is all zero loses its depth lens."""
         view = self.view
-        if not self.colour_times:
+        if not any(self.usable):
             view.notes.append("holds no colour image")
         if self.damaged:
             view.notes.append(f"{self.damaged} damaged images left out")

@@ -128,8 +128,9 @@ class KinectFile(ClosedOnExit):
     def packets(self) -> Iterator[Packet]:
         """Yield all packets in the file's order, one at a time; call once.
 
-        A packet that is no image (a JPEG without start or end, raw data of another size) is left
-        out and counted in ``broken_packets``. A file that was cut off ends early without an error.
+        Raw data of another size than an image's is left out and counted in ``broken_packets``. A
+        damaged JPEG is yielded, because it counts in the numbers of the images. A file that was cut
+        off ends early without an error.
         """
         streams = [self._container.streams[index] for index in self._streams]
         for packet in video.demux(self._container, streams, self._count_broken):
@@ -147,9 +148,9 @@ class KinectFile(ClosedOnExit):
         self.broken_packets += 1
 
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
-        """Whether a packet holds one complete image, or inertial samples."""
+        """Whether a packet holds a JPEG, raw data of an image's size, or inertial samples."""
         if kind == "colour" and self.info.colour_format == "MJPG":
-            return encodings.encoded_size(content) is not None
+            return True
         if kind == "colour":
             width, height = COLOUR_MODES[self.info.colour_mode].size
             return len(content) == round(

@@ -5,10 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
+from intercap_core.formats.detections.image_numbers import camera_images
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.synchronise import (
     OUTLIER,
@@ -16,6 +19,7 @@ from intercap_core.formats.recordings.synchronise import (
     clock_drift_us,
     split_into_epochs,
 )
+from intercap_core.schemas import FRAMES
 from tests.helpers.kinect_files import PERIOD_US, depth_at, entry_of, jpeg_at, notes_of, record, run
 
 TICKS = 12
@@ -132,6 +136,46 @@ def test_a_damaged_file_gives_its_readable_images(capture):
         assert 1 <= frames.colour_available[:, 1].sum() < TICKS
         for t in np.flatnonzero(frames.colour_available[:, 1]):
             assert frames.colour_jpeg(t, 1) == jpeg_at(1, t)
+
+
+def damaged_images() -> tuple[bytes, ...]:
+    """A JPEG that lacks pixels, one that lacks its end too, no image, and one of another size."""
+    noise = np.random.default_rng(0).integers(0, 255, (720, 1280, 3)).astype(np.uint8)
+    content = cv2.imencode(".jpg", noise)[1].tobytes()
+    other = cv2.imencode(".jpg", noise[:360])[1].tobytes()
+    return content[:200_000] + b"\xff\xd9", content[:200_000], b"noise", other
+
+
+def test_damaged_images_keep_their_number(capture):
+    faulty = dict(zip((0, 3, 4, 7), damaged_images(), strict=True))
+    record(
+        capture.recordings, 1, range(TICKS), jpeg_of=lambda c, t: faulty.get(t, jpeg_at(c, t))
+    )  # fmt: skip
+    output = run(capture)
+    note = notes_of(output)["k2"]
+    assert "3 damaged images left out; 1 images of another size left out" in note
+    with artefacts.read(output, FRAMES) as source:
+        images = camera_images(source, capture)[1]
+    whole = [tick not in faulty for tick in range(TICKS)]
+    assert images.number.tolist() == np.where(whole, np.arange(TICKS), -1).tolist()
+    assert images.recorded == set(range(TICKS))
+    with Frames.open(output) as frames:
+        assert frames.colour_available[:, 1].tolist() == whole
+        for tick in np.flatnonzero(whole):
+            assert frames.colour_jpeg(tick, 1) == jpeg_at(1, tick)
+
+
+def test_damaged_images_choose_no_epoch(tmp_path):
+    """The longer epoch has no image that can be used."""
+    folder, damaged = tmp_path / "recordings", damaged_images()[0]
+    folder.mkdir()
+    record(
+        folder, 0, range(TICKS), clock_us=0,
+        times_us=lambda t: (t + 20 * (t < 8)) * PERIOD_US,
+        jpeg_of=lambda c, t: damaged if t < 8 else jpeg_at(c, t),
+    )  # fmt: skip
+    with Frames.open(run(entry_of(folder, cameras=1))) as frames:
+        assert frames.num_sets == 4 and frames.colour_jpeg(0, 0) == jpeg_at(0, 8)
 
 
 def test_a_master_on_another_clock_leaves_the_others(capture):
