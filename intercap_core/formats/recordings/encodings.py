@@ -89,10 +89,11 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
         whole, (orientation, _) = content, _exif_orientation(content.partition(b"eXIf")[2])
     elif content.startswith((*TIFF_STARTS, b"BM")):
         kind = "BMP" if content.startswith(b"BM") else "TIFF"
-        orientation, _ = _exif_orientation(content)  # of a BMP: 1
+        orientation, at = _exif_orientation(content)  # of a BMP: 1
         if kind == "BMP" and int.from_bytes(content[2:6], "little") > len(content):
             raise DamagedImage("is cut off")
-        whole = encode_jpeg(_decode_8_bit(content))
+        # OpenCV turns TIFF files, whatever its flags.
+        whole = encode_jpeg(_decode_8_bit(_as_stored(content, at)))
         remarks.append(f"are {kind}, stored as JPEG of quality {JPEG_QUALITY}")
     elif content.startswith(JPEG_START):
         raise DamagedImage("is no whole JPEG")
@@ -102,8 +103,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
         return whole, "; ".join(remarks)
     if orientation_use == "ignore":
         if jpeg is not None:
-            at = jpeg.orientation_at
-            whole = whole[:at] + b"\1" + whole[at + 1 :]  # 1 = as stored
+            whole = _as_stored(whole, jpeg.orientation_at)
         elif content.startswith(PNG_START):
             whole = encode_jpeg(_decode_8_bit(content))
         remarks.append(
@@ -115,10 +115,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
             f"states orientation {orientation} (turned or mirrored), the depth images none; turn "
             "the colour images, or remove the entry (exiftool -Orientation= FILES)"
         )
-    stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(whole, np.uint8), stored)
-    if image is None:
-        raise DamagedImage("does not decode")
+    image = decode(whole, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     remarks.append(
         f"state orientation {orientation}, were turned by it and stored as JPEG of quality "
         f"{JPEG_QUALITY}"
@@ -134,11 +131,27 @@ def turn(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image[::rows, ::columns])
 
 
-def _decode_8_bit(content: bytes) -> np.ndarray:
-    """(H, W, 3) uint8 BGR of a file as stored; raises :class:`DamagedImage`."""
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+def decode(content: bytes, flags: int) -> np.ndarray:
+    """Decode an image file with OpenCV; raises :class:`DamagedImage`."""
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:  # its head states more pixels than OpenCV decodes
+        image = None
     if image is None:
         raise DamagedImage("does not decode")
+    return image
+
+
+def _as_stored(content: bytes, orientation_at: int) -> bytes:
+    """The file with orientation 1 at an offset of :func:`_exif_orientation`; 0 = no entry."""
+    if orientation_at == 0:
+        return content
+    return content[:orientation_at] + b"\1" + content[orientation_at + 1 :]
+
+
+def _decode_8_bit(content: bytes) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of a file as stored; raises :class:`DamagedImage`."""
+    image = decode(content, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint8:  # of 10 or 12 bits, the share that holds the image is unknown
         raise DamagedImage(f"has pixels of {image.dtype}, expected 8 bits a channel")
     channels = 1 if image.ndim == 2 else image.shape[2]

@@ -19,6 +19,7 @@ from intercap_core.formats.recordings.encodings import (
     TIFF_STARTS,
     DamagedImage,
     OrientationUse,
+    decode,
     encoded_size,
     holds_all_pixels,
     store_colour,
@@ -72,9 +73,7 @@ def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.n
             raise DamagedImage("is cut off")
     elif not content.startswith(TIFF_STARTS):
         raise DamagedImage("is no PNG or TIFF")
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise DamagedImage("does not decode")
+    image = decode(content, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise DamagedImage(

@@ -18,6 +18,7 @@ from intercap_core.formats.recordings.encodings import (
     holds_all_pixels,
     store_colour,
 )
+from intercap_core.formats.recordings.image_files import read_depth
 
 
 def picture(width=50, height=30) -> np.ndarray:
@@ -160,6 +161,50 @@ def test_a_png_with_an_orientation_is_turned():
     length, checksum = struct.pack(">I", len(chunk) - 4), struct.pack(">I", zlib.crc32(chunk))
     stored, _ = store_colour(png[:33] + length + chunk + checksum + png[33:])
     assert np.abs(shown(stored).astype(int) - picture(160, 120)[::-1, ::-1]).mean() < 2
+
+
+def tiff(image: np.ndarray, orientation: int, order: str) -> bytes:
+    """An uncompressed TIFF file of the image (H, W, 3) BGR, at most 65,535 bytes."""
+    height, width, _ = image.shape
+    values = {
+        256: width, 257: height, 259: 1, 262: 2, 273: 142, 274: orientation, 277: 3, 278: height,
+        279: image.size,
+    }  # fmt: skip
+    entries = [struct.pack(f"{order}HHIHH", tag, 3, 1, n, 0) for tag, n in values.items()]
+    entries.insert(2, struct.pack(f"{order}HHII", 258, 3, 3, 136))  # bits: 3 numbers at byte 136
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(entries))
+    content = (head + b"".join(entries)).ljust(136, b"\0") + struct.pack(f"{order}3H", 8, 8, 8)
+    return content + image[..., ::-1].tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_tiff_is_turned_once_or_not_at_all(orientation, order):
+    """OpenCV is the peer that turns."""
+    image = picture(160, 120)
+    content = tiff(image, orientation, order)
+    for use, true in (("turn", shown(content)), ("ignore", image)):
+        stored, remark = store_colour(content, use)
+        assert shown(stored).shape == true.shape and ("orientation" in remark) == (orientation > 1)
+        assert np.abs(shown(stored).astype(int) - true).mean() < 2
+
+
+def test_heads_that_state_too_many_pixels_are_damage(tmp_path):
+    """OpenCV raises for more than 2^20 pixels a side or 2^30 in all."""
+    bmp = bytearray(encoded(".bmp", picture()))
+    bmp[18:22] = struct.pack("<i", 1 << 21)
+    at = JPEG.index(b"\xff\xc0") + 5
+    jpeg = JPEG[:at] + struct.pack(">HH", 65_000, 65_000) + JPEG[at + 4 :]
+    for content in (bytes(bmp), with_exif(jpeg, 6, "<")):
+        with pytest.raises(DamagedImage, match="does not decode"):
+            store_colour(content)
+    depth = bytearray(encoded(".tif", picture()[..., 0].astype(np.uint16)))
+    tag = struct.pack("<H", 256)
+    entry = depth.index(tag + struct.pack("<HI", 3, 1))
+    depth[entry : entry + 12] = tag + struct.pack("<HII", 4, 1, 1 << 21)
+    (tmp_path / "depth.tif").write_bytes(depth)
+    with pytest.raises(DamagedImage, match="does not decode"):
+        read_depth(tmp_path / "depth.tif", (50, 30))
 
 
 @pytest.mark.parametrize("suffix", [".bmp", ".tif"])
