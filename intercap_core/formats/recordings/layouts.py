@@ -9,13 +9,13 @@ from pathlib import Path
 from intercap_core.config_types import LayoutName
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.inputs.files import printable
 
 # Patterns of the files and folders that the workflow watches, below the folder of recordings ("" =
-# that folder). A folder's time changes if an image is added or removed; watching each of the
-# thousands of images would delay every run by minutes.
+# that folder). A folder stands for all files below it.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.[mM][kK][vV]",),
     "intercap": ("Frames_Cam*/*",),
@@ -32,7 +32,7 @@ INPUTS: dict[LayoutName, tuple[str, ...]] = {
 _NO_RECORDINGS = {".h5", ".json", ".yaml", ".yml", ".toml", ".txt", ".tsv", ".part"}
 _DEEPEST = 3  # levels of folders below the recordings that are looked at
 # Paths below the folder of recordings that the layouts read, and their description. A folder whose
-# path with "/" matches is read as a whole.
+# path with "/" matches is read as a whole. Names in braces are those of :func:`list_unread`.
 _READ: dict[LayoutName, tuple[str, str]] = {
     "k4a": (r"[^/]+\.mkv", "<camera>.mkv"),
     "intercap": (
@@ -41,8 +41,8 @@ _READ: dict[LayoutName, tuple[str, str]] = {
     ),
     "behave": (r"t\d{1,6}(\.\d{1,6})?/", "t<seconds>/k<n>.color.jpg and k<n>.depth.png"),
     "plain": (
-        r"{camera}(?-i:_timestamps)\.(csv|txt)|{camera}(?-i:/timestamps)\.(csv|txt)|{camera}\.{video}|"
-        r"{camera}/((colou?r|rgb)/)?[^/]+\.(jpe?g|png|bmp|tiff?)|{camera}/depth/[^/]+\.(png|tiff?)",
+        r"{camera}(?-i:_timestamps){times}|{camera}(?-i:/timestamps){times}|{camera}{video}|"
+        r"{camera}/({colour}/)?[^/]+{image}|{camera}/depth/[^/]+{depth}",
         "<camera>.mp4 (.mov, .mkv, .avi, ...), or <camera>/ with .jpg, .png, .bmp or .tif, and "
         "<camera>/depth/ with 16-bit .png or .tif; a camera's name has letters, digits, '_' and "
         "'-' alone",
@@ -55,9 +55,18 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
 
     Files with suffixes of text and data, and hidden ones, are left out.
     """
+    from intercap_core.formats.recordings import plain, timestamps
+
     pattern, expected = _READ[sequence.layout]
-    video = "(mp4|m4v|mov|mkv|webm|avi|mpe?g|ts|mts)"
-    pattern = pattern.replace("{camera}", "[A-Za-z0-9_-]+").replace("{video}", video)
+    for name, texts in (
+        ("times", timestamps.SUFFIXES),
+        ("video", plain.VIDEO_SUFFIXES),
+        ("image", plain.IMAGE_SUFFIXES),
+        ("depth", plain.DEPTH_SUFFIXES),
+        ("colour", plain.COLOUR_FOLDERS),
+    ):
+        pattern = pattern.replace(f"{{{name}}}", f"({'|'.join(map(re.escape, texts))})")
+    pattern = pattern.replace("{camera}", CAMERA_NAME.pattern)
     is_read = re.compile(pattern, re.IGNORECASE)
     unread: dict[tuple[str, str], list[str]] = {}
     for folder, below, names in os.walk(sequence.recordings, followlinks=True):
@@ -79,13 +88,14 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
             ):
                 unread.setdefault((place, suffix), []).append(name)
     notes = [
-        f"{sequence.recordings}: nothing reads {place}{names[0]}"
-        + (f" and {len(names) - 1} more of {place}*{suffix}" if len(names) > 1 else "")
+        f"{sequence.recordings}: {place}{names[0]}"
+        + (f" and {n - 1} more of {place}*{suffix} are" if (n := len(names)) > 1 else " is")
+        + " not used"
         for (place, suffix), names in unread.items()
     ]
     most = 4  # kinds that are named
     if len(notes) > most:
-        notes[most:] = [f"{sequence.recordings}: nothing reads {len(notes) - most} other kinds"]
+        notes[most:] = [f"{sequence.recordings}: {len(notes) - most} other kinds are not used"]
     return [
         printable(
             f"{note}; layout {sequence.layout} reads {expected}; rename, move or convert them"

@@ -32,6 +32,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts")
 COLOUR_FOLDERS = ("colour", "color", "rgb")
+DEPTH_FOLDER = "depth"
 
 
 class PlainLayout(RecordingLayout):
@@ -142,12 +143,13 @@ class _CameraFolder:
     @classmethod
     def of(cls, path: Path) -> _CameraFolder:
         """Find the folders of colour and depth by their names in any case."""
-        below = sorted(entry for entry in path.iterdir() if entry.is_dir())
+        named = (e for e in path.iterdir() if e.name.lower() in (*COLOUR_FOLDERS, DEPTH_FOLDER))
+        below = sorted(entry for entry in named if entry.is_dir())  # calls nothing for images
         colour_folders = [
             *(entry for name in COLOUR_FOLDERS for entry in below if entry.name.lower() == name),
             path,
         ]
-        depth_folders = [entry for entry in below if entry.name.lower() == "depth"]
+        depth_folders = [entry for entry in below if entry.name.lower() == DEPTH_FOLDER]
         used: list[list[Path]] = []  # files of colour, and of depth
         unused: list[Path] = []
         for folders, suffixes in (
@@ -160,7 +162,7 @@ class _CameraFolder:
         return cls(path, used[0], used[1], unused)
 
     def notes(self, known: CalibratedCamera) -> list[str]:
-        """Notes on files that are not read, and on depth that is stated but absent."""
+        """Notes on files that are not read."""
         notes = [
             f"the images in {self.path.name if entry == self.path else entry.name}/ are not read, "
             "because another folder has its images; keep one of them"

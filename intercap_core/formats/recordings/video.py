@@ -290,7 +290,7 @@ class VideoRecording(CameraRecording):
             offset_s: seconds that are added to all times.
             times: times of :func:`.timestamps.read_timestamps`, one for each image in order; None =
                 the file's clock from its first image on.
-            decoding: how depth files are read.
+            decoding: unit of the depth files; its orientation is not used.
         """
         try:
             self._container = open_container(path)

@@ -422,8 +422,15 @@ def test_files_that_nothing_reads_are_listed(capture, place, count):
     for number in range(count):
         first.with_name(first.name.replace("00000", f"{number:05d}")).write_bytes(b"")
     (note,) = list_unread(capture)
-    assert f"nothing reads {place}" in note and "layout plain reads" in note
-    assert count == 1 or f"and {count - 1} more" in note
+    used = f"{place} is not used" if count == 1 else f"{place} and {count - 1} more of "
+    assert used in note and "not used; layout plain reads" in note
+
+
+def test_images_are_found_without_a_call_for_each(capture, monkeypatch):
+    paths, stat = [], Path.stat
+    monkeypatch.setattr(Path, "stat", lambda path, **o: paths.append(path) or stat(path, **o))
+    assert open_layout(capture).names == ["left", "right", "top"]
+    assert not {path.suffix for path in paths} & {".jpg", ".png"}
 
 
 def test_two_folders_of_colour_are_noted(capture):
