@@ -1,5 +1,7 @@
 """Unit of each camera's depth, by comparison with the person triangulated from keypoints.
 
+A wrong scale of the camera poses gives the same ratio as a wrong unit.
+
 Files of depth do not state their unit: RealSense cameras write 1, 1/4 or 1/10 mm, TUM 1/5000 m, and
 some tools centimetres or metres. Read as millimetres, all distances are off by one factor.
 """
@@ -86,8 +88,10 @@ def describe_factor(ratios: np.ndarray) -> str:
         return ""
     factors = " or ".join(f"{factor:g}" for factor in possible)
     return (
-        f"its depth is {factors} times the distance of the person by keypoints: divide depth_unit "
-        "of the calibration (0.001 = millimetres if not stated) by this factor"
+        f"its depth is {factors} times the distance of the person by keypoints: either the unit of "
+        "its depth is wrong (divide depth_unit of the calibration, 0.001 = millimetres if not "
+        "stated, by this factor), or the scale of the camera poses is (multiply calibration_scale "
+        "by it, or positions in a calibration without scale)"
     )
 
 

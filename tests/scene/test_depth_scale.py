@@ -36,6 +36,7 @@ def test_the_unit_is_named(unit_mm, expected):
     assert len(ratios) == 25 and np.allclose(ratios * unit_mm, 2.6 / 2.65, rtol=0.2)
     note = describe_factor(ratios)
     assert expected in note and bool(expected) == bool(note)
+    assert ("depth_unit" in note) == ("calibration_scale" in note) == bool(note)
 
 
 @pytest.mark.parametrize(
