@@ -38,13 +38,20 @@ def test_relative_indices_give_the_same_solid(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("before", "after"), [(" ", "\t"), ("\nv", "\n  v"), ("\nf", "\n\tf"), ("\nf", " # note\nf")]
-)
+    ("before", "after"),
+    [
+        (" ", "\t"), ("\nv ", "\nv\t"), ("\nv", "\n  v"), ("\nf", "\n\tf"), ("\nf", " # note\nf"),
+        ("\nv", "#note\nv"), ("\nv ", "\nv \\\n"),
+    ],
+)  # fmt: skip
 def test_spaces_and_comments_of_obj_are_read(tmp_path, before, after):
     path = box(tmp_path, "obj")
-    vertices = load(path).vertices
+    (tmp_path / "contact.json").write_text("[5, 6]")
+    plain = load(path, contact_vertices=tmp_path / "contact.json")
     path.write_text(("\n" + path.read_text()).replace(before, after))
-    np.testing.assert_array_equal(load(path).vertices, vertices)
+    mesh = load(path, contact_vertices=tmp_path / "contact.json")
+    np.testing.assert_array_equal(mesh.vertices, plain.vertices)
+    np.testing.assert_array_equal(mesh.contact_vertices, plain.contact_vertices)
 
 
 def test_relative_indices_before_the_first_vertex_are_refused(tmp_path):

@@ -91,7 +91,7 @@ def file_vertices(path: Path, mesh: Any) -> np.ndarray:
     coordinates, and another order if the faces have several materials.
     """
     if path.suffix.lower() == ".obj":
-        lines = map(bytes.split, read_bytes(path, MAX_MODEL_BYTES).splitlines())
+        lines = map(bytes.split, _plain_obj(read_bytes(path, MAX_MODEL_BYTES)).splitlines())
         return np.array([words[1:4] for words in lines if words[:1] == [b"v"]], np.float64)
     raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     if path.suffix.lower() == ".ply" and raw is not None:  # columns by name, binary or ASCII
@@ -194,7 +194,8 @@ def _plain_obj(content: bytes) -> bytes:
     Raises ValueError for an index before the first vertex.
     """
     content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    if not re.search(rb"^f\s[^\n#]*-\d|^[ \t]+[vf]|^[vf]\w?\s[^\n]*[\t#]", content, re.MULTILINE):
+    unread = rb"^f\s[^\n#]*-\d|^[ \t]+[vf]|^[vf]\w?(?=\s)[^\n]*[\t#]"
+    if not re.search(unread, content, re.MULTILINE):
         return content
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
     for line in content.splitlines():
