@@ -175,11 +175,12 @@ class _Copy:
         """
         content = bytes(image.content)
         size = encoded_size(content)
-        if size is not None and size != self.colour_size:
+        usable = size == self.colour_size and holds_all_pixels(content)
+        if size in (None, self.colour_size):
+            self.damaged += not usable
+        else:
             self._refuse("colour", size, self.colour_size, not any(self.usable))
-        whole = size is not None and holds_all_pixels(content)
-        self.damaged += not whole
-        self.usable.append(whole and size == self.colour_size)
+        self.usable.append(usable)
         self.colour_times.append(image.time_us)
         self.offsets.append(self.offsets[-1] + len(content))
         # The end is entropy-coded data, which no two images share.
