@@ -14,6 +14,7 @@ import pytest
 from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.image_numbers import camera_images
 from intercap_core.formats.recordings.encodings import turn
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.layouts import list_unread, open_layout
@@ -458,6 +459,23 @@ def test_an_impossible_unit_of_depth_is_refused(capture, unit):
     capture.calibration.write_text(json.dumps(calibrated() | {"depth_unit": unit}))
     with pytest.raises(UserError, match="depth_unit is"):
         open_layout(capture)
+
+
+def test_a_damaged_image_of_a_video_keeps_its_number(capture):
+    remove_images(capture, "top/*")
+    path = capture.recordings / "top.mkv"
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (*SIZE[::-1], 3)).astype(np.uint8) for _ in range(8)]
+    write_video(path, noise, "mjpeg", fps=FPS)
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0)][3]
+    half = packet[: len(packet) // 2] + b"\xff\xd9"
+    path.write_bytes(path.read_bytes().replace(packet, half.ljust(len(packet), b"\0")))
+    output = run(capture)
+    assert "1 damaged images left out" in notes_of(output)["top"]
+    with artefacts.read(output, FRAMES) as source:
+        images = camera_images(source, capture)[2]
+    assert images.number.tolist() == [0, 1, 2, -1, 4, 5, 6, 7] and len(images.recorded) == 8
 
 
 def test_images_that_lack_most_data_are_left_out(capture):
