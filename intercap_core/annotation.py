@@ -39,12 +39,23 @@ class ContactInterval(Model):
     """First frame set in contact, from 0."""
     end: FrameNumber
     """First frame set after the contact. An interval with end = start is ignored with a warning."""
+    uncertain: Literal["start", "end", "both"] | None = None
+    """Ends that the observed distance may move by ``joint.annotation_uncertainty_frames``; absent =
+    none: the statement holds exactly."""
 
     @model_validator(mode="after")
     def _forward(self) -> ContactInterval:
         if self.end < self.start:
             raise ValueError(f"interval is reversed: start {self.start}, end {self.end}")
         return self
+
+    @property
+    def ends(self) -> tuple[tuple[int, bool], tuple[int, bool]]:
+        """Frame of the start and of the end, each with whether it is uncertain."""
+        return (
+            (self.start, self.uncertain in ("start", "both")),
+            (self.end, self.uncertain in ("end", "both")),
+        )
 
 
 class ObjectPose(Model):

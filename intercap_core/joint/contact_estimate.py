@@ -9,7 +9,12 @@ import numpy as np
 
 from intercap_core.annotation import ContactInterval
 from intercap_core.config import JointSettings
-from intercap_core.joint.contact.annotated import AnnotationIssue, annotation_evidence, find_issues
+from intercap_core.joint.contact.annotated import (
+    AnnotationIssue,
+    annotation_evidence,
+    find_issues,
+    hold_exactly,
+)
 from intercap_core.joint.contact.detect import contact_probability, region_motion
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.state import State
@@ -22,7 +27,7 @@ class ContactEstimate:
 
     probability: np.ndarray  # (T, R); NaN without an object
     labels: np.ndarray  # (T, R) annotation: 1 touching, 0 free, -1 no label
-    issues: Sequence[AnnotationIssue] = ()  # Implausible annotated intervals
+    issues: Sequence[AnnotationIssue] = ()  # Annotated intervals that the fit contradicts
 
     def change(self, other: ContactEstimate) -> float:
         """Largest difference of a probability; 0 without an object."""
@@ -67,14 +72,15 @@ def estimate_contact(
         sequential.object_sigma,
         inputs.fps,
     )
+    detected = contact_probability(motion, inputs.fps)
     if intervals is None:
-        return ContactEstimate(contact_probability(motion, inputs.fps), labels)
+        return ContactEstimate(detected, labels)
     given, labels = annotation_evidence(
         intervals, CONTACT_REGIONS, len(state), settings.annotation_uncertainty_frames
     )
     unseen = sequential.flags.filled | sequential.flags.lost
     return ContactEstimate(
-        contact_probability(motion, inputs.fps, given=given),
+        hold_exactly(contact_probability(motion, inputs.fps, given=given), given),
         labels,
-        find_issues(intervals, CONTACT_REGIONS, motion.distance, unseen),
+        find_issues(intervals, CONTACT_REGIONS, given, detected, motion.distance, unseen),
     )

@@ -203,7 +203,8 @@ def erring_annotation(
             reach = round(5 * scale)
             first = int(np.clip(start + rng.integers(-reach, reach + 1), 0, stage.frames - 1))
             last = int(np.clip(end + rng.integers(-reach, reach + 1), first + 1, stage.frames))
-            intervals.append({"part": name, "start": first, "end": last})
+            interval = {"part": name, "start": first, "end": last, "uncertain": "both"}
+            intervals.append(interval)
     frame = int(rng.integers(0, max(1, stage.frames // 5)))
     pose = stage.rig.master_from_stage @ moment.stage_from_object[frame]
     rotation = turn(np.radians(off(5.0))) @ pose[:3, :3]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.annotation import ContactInterval
-from intercap_core.joint.contact.annotated import annotation_evidence, find_issues
+from intercap_core.joint.contact.annotated import annotation_evidence, find_issues, hold_exactly
 from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.contact.detect import (
     FRAME_SIGMA,
@@ -162,7 +162,10 @@ def _evidence(*intervals: tuple[str, int, int], uncertainty: int = 5):
 
 
 def _intervals(intervals) -> list[ContactInterval]:
-    return [ContactInterval(part=part, start=start, end=end) for part, start, end in intervals]
+    return [
+        ContactInterval(part=part, start=start, end=end, uncertain="both")
+        for part, start, end in intervals
+    ]
 
 
 def test_annotation_is_certain_inside_and_undecided_at_its_ends():
@@ -224,9 +227,65 @@ def test_distance_moves_an_end_within_the_uncertainty(interval, uncertainty, tou
 def test_implausible_annotations_name_frames_and_part(intervals, near, expected):
     distance = np.full((60, 2), 2.0)
     distance[list(near)] = 0.0
-    issues = find_issues(_intervals(intervals), REGIONS, distance, UNSEEN)
-    evidence, labels = _evidence(*intervals)
+    evidence, labels = _evidence(*intervals, uncertainty=0)
+    # the fit agrees with what is stated free
+    detected = np.where(evidence < 0, 0.0, distance < 1.0)
+    issues = find_issues(_intervals(intervals), REGIONS, evidence, detected, distance, UNSEEN)
     assert np.isfinite(evidence).all() and np.isin(labels, (-1, 0, 1)).all()
     assert [(i.frames, i.distrusted) for i in issues] == [(f, d) for f, _, d in expected]
     for issue, (_, text, _) in zip(issues, expected, strict=True):
         assert text in issue.text
+
+
+def _exact(*intervals: tuple[str, int, int]) -> list[ContactInterval]:
+    return [ContactInterval(part=part, start=start, end=end) for part, start, end in intervals]
+
+
+@pytest.mark.parametrize("interval", [(20, 40), (30, 31), (0, 60), (59, 60)])
+@pytest.mark.parametrize("touching", [range(0), range(60), range(23, 37)])
+def test_an_exact_statement_holds_in_every_frame(interval, touching):
+    """Whatever distance and slip show, also for an interval of one frame."""
+    distance = np.full((60, 2), 0.2)
+    distance[list(touching)] = 0.0
+    given, labels = annotation_evidence(_exact(("left_hand", *interval)), REGIONS, 60, 5)
+    found = contact_probability(_motion(distance, 0, 0), FPS, given=given)
+    np.testing.assert_array_equal(hold_exactly(found, given), labels)
+    assert labels[:, 0].sum() == interval[1] - interval[0]
+
+
+@pytest.mark.parametrize(
+    ("uncertain", "open_"),
+    [("start", range(15, 25)), ("end", range(35, 45)), (None, range(0))],
+)
+def test_only_the_marked_end_is_uncertain(uncertain, open_):
+    interval = ContactInterval(part="left_hand", start=20, end=40, uncertain=uncertain)
+    evidence, _ = annotation_evidence([interval], REGIONS, 60, 5)
+    np.testing.assert_array_equal(np.flatnonzero(evidence[:, 0] == 0), open_)
+    assert (evidence[:, 1] < 0).all()
+
+
+def test_an_exact_end_prevails_over_an_uncertain_one_at_the_same_frame():
+    intervals = [
+        ContactInterval(part="any", start=20, end=40, uncertain="both"),
+        *_exact(("left_hand", 20, 40)),
+    ]
+    evidence, _ = annotation_evidence(intervals, REGIONS, 60, 5)
+    assert (evidence[:, 0] != 0).all()
+    assert (evidence[15:45, 1] == 0).all()
+
+
+def test_contradictions_are_named_by_interval_in_both_directions():
+    """The hand is stated to touch where the fit is free, and to be free where the fit touches."""
+    intervals = _exact(("left_hand", 10, 20), ("left_hand", 40, 50))
+    evidence, _ = annotation_evidence(intervals, REGIONS, 60, 5)
+    distance = np.full((60, 2), 0.04)
+    distance[25:28, 0] = 0.0
+    detected = np.where(distance < 0.01, 0.99, 0.01)
+    detected[40:50, 0] = 0.5  # undecided: no contradiction
+    issues = find_issues(intervals, REGIONS, evidence, detected, distance, np.zeros(60, bool))
+    assert [(i.frames, i.distrusted) for i in issues] == [
+        (range(10, 20), True),
+        (range(25, 28), True),
+    ]
+    assert "left_hand annotated 0.04 m from the object or more" in issues[0].text
+    assert "left_hand annotated as free" in issues[1].text

@@ -1,7 +1,8 @@
 /* Contact by body part: the intervals that the program estimated, and those of the annotation.
- * An interval is { part, start, end }: contact in the frames from start to end - 1. If an annotation
- * states contact, nothing touches outside of its intervals. The first edit therefore copies all
- * estimated intervals into the draft. */
+ * An interval is { part, start, end, uncertain }: contact in the frames from start to end - 1. The fit
+ * may move the ends that `uncertain` names ("start", "end", "both"); without it they hold exactly. If an
+ * annotation states contact, nothing touches outside of its intervals. The first edit therefore copies
+ * all estimated intervals into the draft, with uncertain ends. An end that is moved is exact. */
 import { fromBase64 } from "./api.js";
 import { UNCONFIRMED } from "./draft.js";
 
@@ -37,7 +38,7 @@ export class Contact {
       for (let t = 0; t <= this.app.info.frames; t += 1) {
         const on = t < this.app.info.frames && (this.probabilityAt(part, t) ?? 0) >= TOUCHING;
         if (on && start < 0) start = t;
-        if (!on && start >= 0) { intervals.push({ part, start, end: t }); start = -1; }
+        if (!on && start >= 0) { intervals.push({ part, start, end: t, uncertain: "both" }); start = -1; }
       }
     }
     return intervals;
@@ -68,12 +69,23 @@ export class Contact {
     const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
     if (k < 0) return;
     const clamp = (v) => Math.max(0, Math.min(this.app.info.frames, Math.round(v)));
-    const changed = { ...all[k], start: clamp(start), end: clamp(end) };
+    let changed = { ...all[k], start: clamp(start), end: clamp(end) };
+    for (const end of ["start", "end"]) if (changed[end] !== all[k][end]) changed = exact(changed, end);
     if (changed.end <= changed.start) { this.app.say("contact would end before it starts"); return; }
     all[k] = changed;
     unconfirmed.delete(id(interval));
     this.selected = changed;
     this.#store(all, unconfirmed, "contact moved");
+  }
+
+  /* Mark both ends as uncertain, or as exact if one is uncertain. */
+  toggleUncertain(interval) {
+    const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
+    if (k < 0) return;
+    all[k] = interval.uncertain ? exact(exact(all[k], "start"), "end") : { ...all[k], uncertain: "both" };
+    unconfirmed.delete(id(interval));
+    this.selected = all[k];
+    this.#store(all, unconfirmed, "uncertainty of contact changed");
   }
 
   confirm(interval) {
@@ -93,7 +105,7 @@ export class Contact {
   split(interval, frame) {
     if (frame <= interval.start || frame >= interval.end) { this.app.say("go to a frame inside the interval to split it there"); return; }
     const { all, unconfirmed } = this.#editable(), others = all.filter((other) => id(other) !== id(interval));
-    const parts = [{ ...interval, end: frame }, { ...interval, start: frame }];
+    const parts = [exact({ ...interval, end: frame }, "end"), exact({ ...interval, start: frame }, "start")];
     if (unconfirmed.has(id(interval))) parts.forEach((part) => unconfirmed.add(id(part)));
     this.selected = parts[1];
     this.#store([...others, ...parts], unconfirmed, "contact split");
@@ -117,8 +129,8 @@ export class Contact {
     const { all, unconfirmed } = this.#editable(), kept = [];
     for (const interval of all) {
       if (interval.part !== part || interval.end <= start || interval.start >= end) { kept.push(interval); continue; }
-      if (interval.start < start) kept.push({ ...interval, end: start });
-      if (interval.end > end) kept.push({ ...interval, start: end });
+      if (interval.start < start) kept.push(exact({ ...interval, end: start }, "end"));
+      if (interval.end > end) kept.push(exact({ ...interval, start: end }, "start"));
     }
     this.#store(kept, unconfirmed, "contact denied");
   }
@@ -147,6 +159,12 @@ export class Contact {
     return same?.find((interval) => id(interval) === id(this.selected))
       ?? same?.find((interval) => interval.start <= frame && frame < interval.end) ?? null;
   }
+}
+
+/* The interval with an exact "start" or "end". */
+function exact({ uncertain, ...interval }, end) {
+  const other = { start: "end", end: "start" }[end];
+  return uncertain === "both" || uncertain === other ? { ...interval, uncertain: other } : interval;
 }
 
 export const id = (interval) => `${interval.part}:${interval.start}:${interval.end}`;

@@ -163,7 +163,7 @@ export class Timeline {
   #interval(interval) {
     const { app, contact } = this;
     const confirmed = contact.isConfirmed(interval), percent = Math.round(100 * contact.mean(interval));
-    const title = `${readable(interval.part)}, frames ${interval.start} to ${interval.end - 1}, ${confirmed ? "stated" : `estimated, probability ${percent} %`}`;
+    const title = `${readable(interval.part)}, frames ${interval.start} to ${interval.end - 1}, ${confirmed ? (interval.uncertain ? "stated, ends uncertain" : "stated") : `estimated, probability ${percent} %`}`;
     const bar = this.#bar(title, id(interval), confirmed ? "stated" : "estimated", confirmed ? "" : `${percent} %`);
     bar.setAttribute("aria-pressed", String(contact.selected !== null && id(contact.selected) === id(interval)));
     this.#place(bar, interval.start, interval.end);
@@ -220,6 +220,7 @@ export class Timeline {
     refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(selected ? [
       make("b", {}, `${readable(selected.part)} ${selected.start}–${selected.end - 1}`),
       button("Confirm", () => contact.confirm(selected), { title: "C" }),
+      button(selected.uncertain ? "Ends exact" : "Ends uncertain", () => contact.toggleUncertain(selected), { title: "The fit may move uncertain ends by a few frames (joint.annotation_uncertainty_frames); exact ends hold" }),
       button("Starts here", () => contact.change(selected, app.frame, selected.end), { title: "[" }),
       button("Ends here", () => contact.change(selected, selected.start, app.frame + 1), { title: "]" }),
       button("Split here", () => contact.split(selected, app.frame), { title: "K" }),

@@ -1,4 +1,4 @@
-"""Q_t of equation 6 from annotated intervals: evidence by frame, and implausible intervals."""
+"""Q_t of equation 6 from annotated intervals: evidence by frame, and what the fit contradicts."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 
 from intercap_core.annotation import ANY_REGION, ContactInterval
 
+# Least probability at which distance and slip without the annotation contradict a statement.
+CONTRADICTED = 0.95
+
 
 @dataclass(frozen=True)
 class AnnotationIssue:
-    """An implausible annotated interval."""
+    """An annotated interval without frames, or one that the fit contradicts."""
 
     frames: range  # Frames concerned
     text: str  # Description
@@ -29,10 +32,10 @@ def annotation_evidence(
     whole: regions that no interval names are free in all frames. During an interval of an unnamed
     part (``any``) regions that are not named have no label and no evidence.
 
-    The evidence is 0 within ``uncertainty`` frames of an end of an interval, where annotators err
-    and the geometry decides. The middle between two ends always has evidence. Elsewhere it is plus
-    or minus 12, beyond the evidence of distance and slip in one frame, which is between -9 and 7
-    (:mod:`.detect`).
+    The evidence is 0 within ``uncertainty`` frames of an end that is marked as uncertain, where the
+    geometry decides. The middle between two ends always has evidence. In all other frames with a
+    label the statement holds exactly (:func:`hold_exactly`); there the evidence is plus or minus
+    100, far beyond that of distance and slip and of the chain's transitions (:mod:`.detect`).
     """
     labels = np.zeros((frames, len(regions)), np.int8)
     # intervals of an unnamed part come first: those of a named part overwrite their labels
@@ -43,58 +46,70 @@ def annotation_evidence(
         else:
             labels[during, regions.index(interval.part)] = 1
     certain = np.ones(labels.shape, bool)
-    for r in range(len(regions)):
+    for r, region in enumerate(regions):
+        stated = [end for i in intervals if i.part in (region, ANY_REGION) for end in i.ends]
+        unsure = {at for at, doubt in stated if doubt} - {at for at, doubt in stated if not doubt}
         ends = [0, *(np.flatnonzero(np.diff(labels[:, r])) + 1), frames]
         for start, end in pairwise(ends):
             inside = np.arange(start, end) + 0.5
-            begins = inside - start if start > 0 else np.full(end - start, np.inf)
-            finishes = end - inside if end < frames else np.full(end - start, np.inf)
+            begins = inside - start if start in unsure else np.full(end - start, np.inf)
+            finishes = end - inside if end in unsure else np.full(end - start, np.inf)
             away = np.minimum(begins, finishes)
             certain[start:end, r] = away > min(uncertainty, (end - start) / 2 - 1)
     sign = np.choose(labels + 1, (0.0, -1.0, 1.0))  # of the labels -1, 0, 1
-    return sign * certain * 12.0, labels
+    return sign * certain * 100.0, labels
+
+
+def hold_exactly(probability: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """Probability (T, R) that equals the statement, 0 or 1, where the annotation has evidence."""
+    return np.where(evidence != 0, evidence > 0, probability)
 
 
 def find_issues(
     intervals: Sequence[ContactInterval],
     regions: Sequence[str],
+    evidence: np.ndarray,
+    detected: np.ndarray,
     distance: np.ndarray,
     unseen: np.ndarray,
 ) -> list[AnnotationIssue]:
-    """Find implausible annotated intervals.
+    """Find annotated intervals that have no frames, or that the fit contradicts.
+
+    Frames in which the fit is free of a part that is stated to touch, and frames in which it
+    touches a part that is stated to be free.
 
     Args:
+        evidence: (T, R) of the annotation.
+        detected: (T, R) probability of contact by the fit alone.
         distance: (T, R) of each region to the object in the fit, metres.
         unseen: (T,) frames in which body or object was not seen.
     """
     issues = []
     for interval in intervals:
-        if interval.end > interval.start:
-            issues += _find_far(interval, regions, distance, unseen)
-        else:
-            text = f"contact of {interval.part} annotated for no frame at {interval.start}"
+        part, during = interval.part, np.zeros(len(unseen), bool)
+        if interval.end == interval.start:
+            text = f"contact of {part} annotated for no frame at {interval.start}"
             issues.append(AnnotationIssue(range(interval.start, interval.end), text))
-    return issues
-
-
-def _find_far(
-    interval: ContactInterval, regions: Sequence[str], distance: np.ndarray, unseen: np.ndarray
-) -> list[AnnotationIssue]:
-    """Find runs of frames in which the annotated part is more than 0.15 m from the object.
-
-    The limit is tuned: unflagged frames of the studio have smaller errors.
-    """
-    of_part = (
-        distance.min(axis=1)
-        if interval.part == ANY_REGION
-        else distance[:, regions.index(interval.part)]
-    )
-    during = slice(interval.start, interval.end)
-    far = np.flatnonzero((of_part[during] > 0.15) & ~unseen[during]) + interval.start
-    issues = []
-    for run in np.split(far, np.flatnonzero(np.diff(far) > 1) + 1):
-        if len(run):
-            metres = of_part[run].min()
-            text = f"contact of {interval.part} annotated {metres:.2f} m from the object or more"
+            continue
+        during[interval.start : interval.end] = True
+        of = np.arange(len(regions)) if part == ANY_REGION else np.array([regions.index(part)])
+        if part != ANY_REGION:
+            during &= evidence[:, of[0]] > 0
+        free = (detected[:, of] < 1 - CONTRADICTED).all(axis=1)
+        for run in _runs(during & free & ~unseen):
+            metres = distance[np.ix_(run, of)].min()
+            text = f"contact of {part} annotated {metres:.2f} m from the object or more"
+            issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
+    touching = (detected > CONTRADICTED) & (evidence < 0) & ~unseen[:, None]
+    for r, region in enumerate(regions):
+        for run in _runs(touching[:, r]):
+            text = f"{region} annotated as free, and the fit touches the object with it"
             issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
     return issues
+
+
+def _runs(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the frames of each run of set frames of ``mask`` (T,)."""
+    frames = np.flatnonzero(mask)
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    return [run for run in runs if len(run)]

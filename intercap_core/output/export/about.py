@@ -283,8 +283,8 @@ class About:
             entries["made_by"] = self.made_by
         if self.contact is not None:
             entries["contact"] = [
-                {"part": part, "start": start, "end": end}
-                for part, start, end in self.contact.intervals()
+                interval.model_dump(include={"part", "start", "end"})
+                for interval in self.contact.intervals()
             ]
         return entries | {"by_frame": self._per_frame_json()}
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.annotation import ContactInterval
 from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -18,8 +19,17 @@ from intercap_core.schemas import JOINT, METRICS
 _DRAFT_HEADER = """\
 # Draft of the contact of {sequence}, as the joint stage states it: correct it, and copy it to
 # annotations/{sequence}.yaml. Frames are numbered from 0; an interval's end is the first frame
-# after it. The comment after an interval is its mean and least probability{annotated}.
+# after it. Ends marked "uncertain" may be moved by the observed distance; remove the mark from ends
+# that you correct. The comment after an interval is its mean and least probability{annotated}.
 """
+
+
+_UNCERTAIN: dict[tuple[bool, bool], Literal["start", "end", "both"] | None] = {
+    (True, True): None,
+    (False, True): "start",
+    (True, False): "end",
+    (False, False): "both",
+}  # by whether start and end are exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +55,23 @@ class StatedContact:
                 fit["contact_annotated"],
             )
 
-    def intervals(self) -> list[tuple[str, int, int]]:
-        """Return (region, start, end) of each contact, region by region.
+    def intervals(self) -> list[ContactInterval]:
+        """Return each contact, region by region.
 
-        In the frames from start to end - 1, the probability is at least 0.5.
+        In the frames from start to end - 1, the probability is at least 0.5. Ends are uncertain
+        unless an annotation states them exactly.
         """
         intervals = []
         for r, region in enumerate(self.regions):
             on = np.concatenate([[False], self.probability[:, r] >= 0.5, [False]])
             changes = np.flatnonzero(np.diff(on.astype(np.int8)))
-            intervals += [(region, int(a), int(b)) for a, b in changes.reshape(-1, 2)]
+            p = np.concatenate([[0.0], self.probability[:, r], [0.0]])
+            exact = abs(np.diff(p)) == 1  # before each frame: from 0 to 1 or back
+            for start, end in changes.reshape(-1, 2).tolist():
+                uncertain = _UNCERTAIN[bool(exact[start]), bool(exact[end])]
+                intervals.append(
+                    ContactInterval(part=region, start=start, end=end, uncertain=uncertain)
+                )
         return intervals
 
 
@@ -196,10 +213,12 @@ def draft(stated: StatedContact) -> str:
     if not intervals:
         return header + "# Nothing touches.\ncontact: []\n"
     lines = []
-    for region, start, end in intervals:
-        p = stated.probability[start:end, stated.regions.index(region)]
+    for interval in intervals:
+        start, end = interval.start, interval.end
+        p = stated.probability[start:end, stated.regions.index(interval.part)]
+        doubt = f", uncertain: {interval.uncertain}" if interval.uncertain else ""
         lines.append(
-            f"  - {{part: {region}, start: {start}, end: {end}}}"
+            f"  - {{part: {interval.part}, start: {start}, end: {end}{doubt}}}"
             f"  # {p.mean():.2f}, least {p.min():.2f}\n"
         )
     return header + "contact:\n" + "".join(lines)

@@ -10,6 +10,7 @@ from tests.helpers.browser import needs_chromium
 
 pytestmark = needs_chromium
 NONE = "the annotation states that nothing touches"
+START = {"uncertain": "start"}  # an end of the estimate that nobody moved
 
 
 def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
@@ -17,7 +18,7 @@ def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
     with served(settings) as server, open_page(server) as hand:
         x, y, width, _ = hand.box(HAND)
         hand.drag((x + width - 4, y + 10), (-2 * width / 6, 3))
-        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 6}]
+        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 6} | START]
         hand.press("Control+z")
         assert hand.draft("contact") is None
         hand.press("Control+Shift+z")
@@ -26,8 +27,8 @@ def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
         hand.press("k")
         assert [interval["start"] for interval in hand.draft("contact")] == [2, 4]
         hand.press("Delete")
-        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 4}]
-        assert "+  - {part: right_hand, start: 2, end: 4}" in hand.open_save()
+        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 4} | START]
+        assert "+  - {part: right_hand, start: 2, end: 4, uncertain: start}" in hand.open_save()
         hand.answer("save")
         hand.wait(SAVED)
     text = annotation(settings).read_text()

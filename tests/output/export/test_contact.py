@@ -39,7 +39,14 @@ def test_the_draft_reads_back_as_the_stated_contact(contacts):
 def test_the_draft_says_how_sure_each_interval_is():
     stated = _stated(("mouth", 20, 24))
     stated.probability[20, CONTACT_REGIONS.index("mouth")] = 0.5
-    assert "{part: mouth, start: 20, end: 24}  # 0.80, least 0.50" in draft(stated)
+    assert "{part: mouth, start: 20, end: 24, uncertain: both}  # 0.80, least 0.50" in draft(stated)
+
+
+def test_ends_that_an_annotation_states_stay_exact_in_the_draft():
+    stated = _stated(("mouth", 20, 24))
+    mouth = stated.probability[:, CONTACT_REGIONS.index("mouth")]
+    mouth[:20], mouth[20:24] = 0.0, 1.0
+    assert "{part: mouth, start: 20, end: 24, uncertain: end}  # 1.00" in draft(stated)
 
 
 def test_the_contact_table_has_a_row_per_frame_and_region():
