@@ -107,8 +107,9 @@ def _contact(
         if sets[0] == sets[1]:
             faults.append(f"contact.txt: no image from {first} to {end}")
             continue
-        interval = {"part": ANY_REGION, "start": sets[0], "end": sets[1], "uncertain": "both"}
-        intervals.append(interval)
+        intervals.append(
+            {"part": ANY_REGION, "start": sets[0], "end": sets[1], "uncertain": "both"}
+        )
     return intervals or None
 
 

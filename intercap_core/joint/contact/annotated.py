@@ -48,7 +48,8 @@ def annotation_evidence(
     certain = np.ones(labels.shape, bool)
     for r, region in enumerate(regions):
         stated = [end for i in intervals if i.part in (region, ANY_REGION) for end in i.ends]
-        unsure = {at for at, doubt in stated if doubt} - {at for at, doubt in stated if not doubt}
+        unsure = {at for at, doubt in stated if doubt and 0 < at < frames}
+        unsure -= {at for at, doubt in stated if not doubt}
         ends = [0, *(np.flatnonzero(np.diff(labels[:, r])) + 1), frames]
         for start, end in pairwise(ends):
             inside = np.arange(start, end) + 0.5
