@@ -184,8 +184,8 @@ class JointSettings(Model):
     detect_contact: bool = True
     """Detect contact from the geometry in sequences without contact annotation."""
     annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5
-    """Uncertainty of ends of annotated contact that are marked ``uncertain``, frames. Within it, the
-    observed distance may move the ends. All other statements hold exactly."""
+    """Uncertainty of ends of annotated contact that are marked ``uncertain``, frames. Within it,
+    the observed distance may move the ends. All other statements hold exactly."""
 
     @property
     def lemo_files(self) -> tuple[Path, Path] | None:
