@@ -54,6 +54,13 @@ def test_spaces_and_comments_of_obj_are_read(tmp_path, before, after):
     np.testing.assert_array_equal(mesh.contact_vertices, plain.contact_vertices)
 
 
+def test_a_vertex_with_two_numbers_is_refused(tmp_path):
+    path = box(tmp_path, "obj")
+    path.write_text(path.read_text() + "v 1 2\n")
+    with pytest.raises(UserError, match="vertex has other than three"):
+        load(path)
+
+
 def test_relative_indices_before_the_first_vertex_are_refused(tmp_path):
     path = tmp_path / "box.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 -2 -1\n")

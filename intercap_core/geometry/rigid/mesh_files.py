@@ -92,7 +92,12 @@ def file_vertices(path: Path, mesh: Any) -> np.ndarray:
     """
     if path.suffix.lower() == ".obj":
         lines = map(bytes.split, _plain_obj(read_bytes(path, MAX_MODEL_BYTES)).splitlines())
-        return np.array([words[1:4] for words in lines if words[:1] == [b"v"]], np.float64)
+        try:
+            return np.array([words[1:4] for words in lines if words[:1] == [b"v"]], np.float64)
+        except ValueError:
+            raise UserError(
+                f"{path}: a vertex has other than three numbers; export the mesh again"
+            ) from None
     raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     if path.suffix.lower() == ".ply" and raw is not None:  # columns by name, binary or ASCII
         return np.column_stack([np.ravel(raw[axis]) for axis in "xyz"]).astype(np.float64)

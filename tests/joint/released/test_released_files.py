@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.formats.released import (
+    BEHAVE_OBJECT,
+    BEHAVE_PERSON,
     intercap_file,
     object_fits,
     object_poses_at_30_fps,
@@ -74,6 +76,14 @@ def test_poses_at_30_fps_are_listed_by_time(tmp_path):
     rng = np.random.default_rng(0)
     poses, angles, trans = (rng.normal(size=size) for size in ((3, 156), (2, 3), (2, 3)))
     assert person_poses_at_30_fps(tmp_path) == object_poses_at_30_fps(tmp_path) == {}
+    for name, read in (
+        (BEHAVE_PERSON, person_poses_at_30_fps),
+        (BEHAVE_OBJECT, object_poses_at_30_fps),
+    ):
+        (tmp_path / name).symlink_to("nowhere")
+        with pytest.raises(UserError, match=name):
+            read(tmp_path)
+        (tmp_path / name).unlink()
     write_30_fps(tmp_path, ["0003.000", "0003.033"], poses, angles, trans)
     objects = object_poses_at_30_fps(tmp_path)
     assert list(objects) == [3_000_000, 3_033_000]
