@@ -1,9 +1,8 @@
 """Unit of each camera's depth, by comparison with the person triangulated from keypoints.
 
-A wrong scale of the camera poses gives the same ratio as a wrong unit.
-
-Files of depth do not state their unit: RealSense cameras write 1, 1/4 or 1/10 mm, TUM 1/5000 m, and
-some tools centimetres or metres. Read as millimetres, all distances are off by one factor.
+Depth files do not state their unit: RealSense cameras write 1, 1/4 or 1/10 mm, TUM 1/5000 m, and
+some tools centimetres or metres. If it is read as millimetres, all distances are wrong by one
+factor. A wrong scale of the camera poses has the same effect.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ MIN_POINTS = 12  # half of the body points of one image
 # Depth of the skin over that of the joint: skin is nearer by up to 0.13 m at 1.3 m, feet stand on
 # the floor behind them. Narrow enough to tell 4 from 5.
 ON_THE_BODY = (0.87, 1.1)
-# Share of points on the body at which a factor is possible: objects before the person hide up to
-# 75 % of the points and may be at half of the distance. In 262 cameras of virtual recordings with
+# Share of points on the body at which a factor is possible: objects in front of the person hide up
+# to 75 % of the points and may be at half of the distance. In 262 cameras of virtual recordings with
 # right units (biases of depth, two cameras, keypoints of MediaPipe) the share is 0.27 to 1.
 MIN_SHARE = 0.2
 

@@ -37,7 +37,7 @@ def test_without_a_table_offsets_are_zero() -> None:
 def test_the_packaged_table_is_found_by_its_name() -> None:
     named = BodyFitSettings.model_validate({"keypoint_definition": "mediapipe"})
     offsets = dict(zip(POINTS, Definition.read(named.keypoint_definition).offsets, strict=True))
-    # MediaPipe's ankle is above the model's on both sides, and an ear lies beside the head's joint
+    # MediaPipe's ankles are above those of the model, and its ears are farther out
     assert offsets["left_ankle"][1] > 0.01 and offsets["right_ankle"][1] > 0.01
     assert offsets["left_ear"][0] < -0.02 < 0.02 < offsets["right_ear"][0]
     own = BodyFitSettings.model_validate({"keypoint_definition": "lab/own.tsv"})

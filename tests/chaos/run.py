@@ -1,13 +1,13 @@
-"""`make chaos`: what a cluster does to a run, and one command that goes on: ``python -m
-tests.chaos.run``.
+"""`make chaos`: faults that happen on a cluster, and recovery by one command.
 
-A small dataset is computed in peace. Copies of it are killed at a random moment of every stage of
-every sequence and while Snakemake plans, run out of disk, have their results damaged, and see the
-clock jump. After each, ``intercap run`` goes on; in the end every file must be the peaceful run's,
-byte for byte. So it must be after all files were dated ahead of the clock or behind it, and after
-files of exports, pages, tables and site were damaged, removed, or replaced by links, pipes and
-files that unpack to gigabytes. Adds ``chaos.*`` to results/bench.json. Disks need a user who may
-mount a tmpfs, the clock libfaketime (Debian: faketime); where one is missing, that is said.
+A small dataset is computed without disturbance. Copies of it are killed at a random moment of every
+stage of every sequence and while Snakemake plans, run out of disk space, have damaged results, and
+run with a wrong clock. After each fault ``intercap run`` is started again; in the end every file must
+be identical to that of the undisturbed run. The same holds after all files were dated ahead of the
+clock or behind it, and after files of exports, pages, tables and site were damaged, removed, or
+replaced by links, pipes and files that unpack to gigabytes. Adds ``chaos.*`` to results/bench.json.
+Full disks need a user who may mount a tmpfs, wrong clocks need libfaketime (Debian: faketime);
+without them the round is skipped and a line says so.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Fault(Exception):
     """What should not have happened."""
 
 
-def killed(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def killed(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """Kills of the whole group; returns how many, and after how many the output was identical."""
-    usual = peaceful.seconds()
+    usual = undisturbed.seconds()
     left, killed_in = set(usual), []
     for _ in range(KILLS_BEFORE_JOBS):
         kill_after(victim, random.uniform(0.2, 4.0))
@@ -53,19 +53,19 @@ def killed(peaceful: Victim, victim: Victim) -> tuple[int, int]:
         killed_in.append(job)
         print(f"killed in {job[1]} of {job[0] or 'all'}", flush=True)
     _goes_on(victim)
-    same = identical(victim, peaceful)
+    same = identical(victim, undisturbed)
     well = [job for job in killed_in if all(same[name] for name in same if _is_of(name, job))]
     rest = KILLS_BEFORE_JOBS if all(same.values()) else 0
     _tell(same)
     return len(killed_in) + KILLS_BEFORE_JOBS, len(well) + rest
 
 
-def full_disk(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def full_disk(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """Results on a disk that is too small, and grows by little; returns how often a run ended for
     it and said so, and after how many of these the end was identical."""
     results = victim.flow.folder / "results"
     results.mkdir()
-    recordings = peaceful.flow.results / "recordings"
+    recordings = undisturbed.flow.results / "recordings"
     taken = sum(file.stat().st_size for file in recordings.rglob("*") if file.is_file()) / 1e6
     size, ended = taken * 1.05 + FIRST_ROOM_MB, 0
     subprocess.run(
@@ -85,18 +85,18 @@ def full_disk(peaceful: Victim, victim: Victim) -> tuple[int, int]:
             size += MORE_ROOM_MB
             print(f"a disk of {size - MORE_ROOM_MB:.0f} MB was full, and it was said", flush=True)
             subprocess.run(["mount", "-o", f"remount,size={size:.0f}m", results], check=True)
-        same = identical(victim, peaceful)
+        same = identical(victim, undisturbed)
         _tell(same)
         return ended, ended if all(same.values()) else 0
     finally:
         subprocess.run(["umount", results], check=False)
 
 
-def damaged(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def damaged(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """Each artefact, one at a time and then all at once; returns how many were damaged, and how
     many were made again as they were."""
-    shutil.copytree(peaceful.flow.results, victim.flow.results)
-    wanted = identical(victim, peaceful)
+    shutil.copytree(undisturbed.flow.results, victim.flow.results)
+    wanted = identical(victim, undisturbed)
     if not all(wanted.values()):
         raise Fault("a copy is not a copy")
     paths = [
@@ -112,17 +112,17 @@ def damaged(peaceful: Victim, victim: Victim) -> tuple[int, int]:
             name = path.relative_to(victim.flow.results)
             print(f"{name}: {damage(path)}", flush=True)
         _goes_on(victim)
-        same = identical(victim, peaceful)
+        same = identical(victim, undisturbed)
         _tell(same)
         done += len(some)
         good += sum(same[path.relative_to(victim.flow.results).as_posix()] for path in some)
     return done, good
 
 
-def clock_jumps(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def clock_jumps(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """A run whose clock is days ahead is killed, one goes on whose clock is days behind and is
     killed, and one goes on by the true clock; returns jumps, and how many ended identical."""
-    half = sum(peaceful.seconds().values()) / 4
+    half = sum(undisturbed.seconds().values()) / 4
     for days in (3, -5):
         run = victim.start({
             "LD_PRELOAD": str(FAKETIME), "FAKETIME": f"{days * DAY_S:+d}s",
@@ -132,17 +132,17 @@ def clock_jumps(peaceful: Victim, victim: Victim) -> tuple[int, int]:
         victim.kill(run)
         print(f"killed by a clock {days:+d} days off", flush=True)
     _goes_on(victim)
-    same = identical(victim, peaceful)
+    same = identical(victim, undisturbed)
     _tell(same)
     return 2, 2 if all(same.values()) else 0
 
 
-def dates(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def dates(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """All files of the user and of the results dated ahead of the clock, then behind it.
 
     A damaged artefact makes jobs run. Returns the number of runs, and how many were identical.
     """
-    shutil.copytree(peaceful.flow.results, victim.flow.results)
+    shutil.copytree(undisturbed.flow.results, victim.flow.results)
     good = 0
     for days in (2, -9):
         damage(random.choice(sorted(victim.flow.results.glob("*/metrics.h5"))))
@@ -152,16 +152,16 @@ def dates(peaceful: Victim, victim: Victim) -> tuple[int, int]:
                 os.utime(path, (date, date))
         print(f"all files dated {days:+d} days", flush=True)
         _goes_on(victim)
-        same = identical(victim, peaceful)
+        same = identical(victim, undisturbed)
         _tell(same)
         good += all(same.values())
     return 2, good
 
 
-def deliverables(peaceful: Victim, victim: Victim) -> tuple[int, int]:
+def deliverables(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
     """Files of exports, pages, tables, card and site, and artefacts, of which each is damaged,
     replaced, or made to unpack to gigabytes; returns how many, and how many were made again."""
-    shutil.copytree(peaceful.flow.results, victim.flow.results)
+    shutil.copytree(undisturbed.flow.results, victim.flow.results)
     results = victim.flow.results
     patterns = ("*/export/**/*", "site/sequences/**/*", "site/*", "tables/*", "*.*", "*/*.h5")
     chosen = {}
@@ -181,7 +181,7 @@ def deliverables(peaceful: Victim, victim: Victim) -> tuple[int, int]:
     for path, change in chosen.items():
         print(f"{path.relative_to(results)}: {change(path)}", flush=True)
     _goes_on(victim)
-    same = identical(victim, peaceful)
+    same = identical(victim, undisturbed)
     _tell(same)
     return len(chosen), sum(same[path.relative_to(results).as_posix()] for path in chosen)
 
@@ -238,8 +238,8 @@ def main() -> int:
     figures: dict[str, float] = {}
     tried = survived = 0
     with tempfile.TemporaryDirectory() as folder:
-        peaceful = _copy(Path(folder), "peaceful")
-        _goes_on(peaceful)
+        undisturbed = _copy(Path(folder), "undisturbed")
+        _goes_on(undisturbed)
         for name in arguments.rounds:
             run, missing = ROUNDS[name]
             if missing:
@@ -247,7 +247,7 @@ def main() -> int:
                 continue
             print(f"{name}:", flush=True)
             try:
-                count, well = run(peaceful, _copy(Path(folder), name))
+                count, well = run(undisturbed, _copy(Path(folder), name))
             except (Fault, AssertionError) as fault:
                 print(f"{name}: {fault}")
                 count, well = 1, 0

@@ -108,6 +108,16 @@ def read_tool_calibration(
     return None if reader is None else reader.read(path, recorded, scale)
 
 
+def only_file(path: Path, files: Sequence[Path]) -> Path:
+    """Return the only calibration among ``files``; raises UserError, naming ``path``, if several."""
+    if len(files) > 1:
+        raise UserError(
+            f"{path}: holds {', '.join(file.name for file in files)}; name the one that is the "
+            "calibration"
+        )
+    return files[0]
+
+
 def refuse_scale(path: Path, scale: float | None) -> None:
     """Raise UserError if a scale is stated for a file in metres."""
     if scale is not None:

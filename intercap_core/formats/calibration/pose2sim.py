@@ -17,6 +17,7 @@ from intercap_core.formats.calibration.files import (
     CalibrationReader,
     RecordedCameras,
     ToolCamera,
+    only_file,
     to_calibration,
 )
 from intercap_core.formats.calibration.opencv import (
@@ -39,13 +40,7 @@ def _toml_files(path: Path) -> list[Path]:
 
 def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
     """Read a file, or the only TOML file of a folder; raises UserError naming camera and field."""
-    files = _toml_files(path)
-    if len(files) > 1:
-        raise UserError(
-            f"{path}: holds {', '.join(file.name for file in files)}; name the one that is the "
-            "calibration"
-        )
-    path = files[0]
+    path = only_file(path, _toml_files(path))
     tables = _camera_tables(path)
     cameras = []
     for section, table in tables.items():

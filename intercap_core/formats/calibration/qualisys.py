@@ -20,6 +20,7 @@ from intercap_core.formats.calibration.files import (
     CalibrationReader,
     RecordedCameras,
     ToolCamera,
+    only_file,
     refuse_scale,
     to_calibration,
 )
@@ -48,13 +49,7 @@ def _qca_files(path: Path) -> list[Path]:
 
 def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
     """Read a file, or the only one of a folder; raises UserError naming camera and field."""
-    files = _qca_files(path)
-    if len(files) > 1:
-        raise UserError(
-            f"{path}: holds {', '.join(file.name for file in files)}; name the one that is the "
-            "calibration"
-        )
-    path = files[0]
+    path = only_file(path, _qca_files(path))
     refuse_scale(path, scale)
     cameras = [
         _camera(path, element)

@@ -10,7 +10,7 @@ from tests.helpers.browser import needs_chromium
 
 pytestmark = needs_chromium
 NONE = "the annotation states that nothing touches"
-START = {"uncertain": "start"}  # an end of the estimate that nobody moved
+START = {"uncertain": "start"}  # an estimated end that was not edited
 
 
 def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:

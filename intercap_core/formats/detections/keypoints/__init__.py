@@ -173,8 +173,8 @@ def visible(points: np.ndarray) -> np.ndarray:
 def compare_bones(people: np.ndarray) -> float | None:
     """Length of long bones (upper quartile) as a share of the median distance of two body points.
 
-    A wrong layout joins points at random, so its share is near 1. Returns the median over
-    people, of whom ``MAX_COMPARED`` are compared; None if nobody has enough points.
+    A wrong layout joins points at random, so its share is near 1. Returns the median over at most
+    ``MAX_COMPARED`` people; None if no person has enough points.
 
     Args:
         people: keypoints (P, 135, 3) in the shared order.
