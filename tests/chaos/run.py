@@ -2,9 +2,9 @@
 
 A small dataset is computed without disturbance. Copies of it are killed at a random moment of every
 stage of every sequence and while Snakemake plans, run out of disk space, have damaged results, and
-run with a wrong clock. After each fault ``intercap run`` is started again; in the end every file must
-be identical to that of the undisturbed run. The same holds after all files were dated ahead of the
-clock or behind it, and after files of exports, pages, tables and site were damaged, removed, or
+run with a wrong clock. After each fault ``intercap run`` is started again; in the end every file
+must be identical to that of the undisturbed run. The same holds after all files were dated ahead of
+the clock or behind it, and after files of exports, pages, tables and site were damaged, removed, or
 replaced by links, pipes and files that unpack to gigabytes. Adds ``chaos.*`` to results/bench.json.
 Full disks need a user who may mount a tmpfs, wrong clocks need libfaketime (Debian: faketime);
 without them the round is skipped and a line says so.
