@@ -23,8 +23,8 @@ MIN_POINTS = 12  # half of the body points of one image
 # the floor behind them. Narrow enough to tell 4 from 5.
 ON_THE_BODY = (0.87, 1.1)
 # Share of points on the body at which a factor is possible: objects in front of the person hide up
-# to 75 % of the points and may be at half of the distance. In 262 cameras of virtual recordings with
-# right units (biases of depth, two cameras, keypoints of MediaPipe) the share is 0.27 to 1.
+# to 75 % of the points and may be at half of the distance. In 262 cameras of virtual recordings
+# with right units (biases of depth, two cameras, keypoints of MediaPipe) the share is 0.27 to 1.
 MIN_SHARE = 0.2
 
 

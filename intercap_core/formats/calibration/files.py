@@ -109,7 +109,7 @@ def read_tool_calibration(
 
 
 def only_file(path: Path, files: Sequence[Path]) -> Path:
-    """Return the only calibration among ``files``; raises UserError, naming ``path``, if several."""
+    """Return the only calibration of ``path``; raises UserError if there are several."""
     if len(files) > 1:
         raise UserError(
             f"{path}: holds {', '.join(file.name for file in files)}; name the one that is the "
