@@ -5,7 +5,7 @@
 # make test-slurm      the workflow on a real Slurm (Debian: slurm-wlm, munge; as root), with faults
 # make chaos           runs that are killed, disks that are full, results that are damaged
 # make fuzz            damaged files of every kind that a user supplies
-# make cases           files as people have them, from public bug reports
+# make cases           input files that reproduce public bug reports
 # make lint            ruff, import-linter, snakefmt, mypy, snakemake --lint
 # make mediapipe       environment of a real keypoint detector, for make evaluate
 # make evaluate        all evaluation recordings against truth, into results/evaluation.json

@@ -30,7 +30,7 @@ MADE_FROM = "made_from"  # attribute with the manifest of pipeline.provenance
 PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # one chunk fits into HDF5's default chunk cache
-_CHECKED_BYTES = 1 << 30  # a smaller dataset is read whatever it stores
+_CHECKED_BYTES = 1 << 30  # the ratio is not checked for smaller datasets
 _MAX_RATIO = 1 << 16  # bytes unpacked per byte stored; Blosc2 packs a chunk of zeros into 32 bytes
 
 
@@ -509,9 +509,9 @@ def _check_dataset(
 
 
 def _declares_too_much(dataset: h5py.Dataset) -> bool:
-    """Whether a dataset is larger than what its stored bytes can unpack to: most is a fill value.
+    """Whether a dataset's size exceeds what its stored bytes can unpack to.
 
-    Reading would take memory or time without a bound.
+    The rest would be fill values, which take unbounded memory or time to read.
     """
     size = dataset.nbytes
     return bool(size > _CHECKED_BYTES and size > _MAX_RATIO * dataset.id.get_storage_size())

@@ -45,7 +45,7 @@ def serve(
         import uvicorn
 
         from intercap_core.annotate.annotator import Annotator
-        from intercap_core.annotate.server import Protocol, application
+        from intercap_core.annotate.server import LimitedProtocol, application
     except ModuleNotFoundError as error:
         raise UserError(
             f"the page needs the package {error.name}: pip install 'intercap-core[annotate]'"
@@ -74,7 +74,7 @@ def serve(
             _show(address)
         options = uvicorn.Config(
             application(annotator, token), log_level="error", access_log=False,
-            server_header=False, timeout_graceful_shutdown=2, ws="none", http=Protocol,
+            server_header=False, timeout_graceful_shutdown=2, ws="none", http=LimitedProtocol,
         )  # fmt: skip
         try:
             uvicorn.Server(options).run(sockets=[listening])

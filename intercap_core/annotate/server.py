@@ -215,7 +215,7 @@ def refusal(method: str, path: str, headers: dict[str, str], token: str) -> tupl
     return None
 
 
-class Protocol(H11Protocol):
+class LimitedProtocol(H11Protocol):
     """HTTP/1.1 with a limit of the connections that have sent no complete request.
 
     Above ``MAX_WAITING``, the oldest is closed, so that others on this machine cannot use up the
@@ -225,7 +225,7 @@ class Protocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.opened = time.monotonic()
-        others = [other for other in self.connections if isinstance(other, Protocol)]
+        others = [other for other in self.connections if isinstance(other, LimitedProtocol)]
         waiting = [other for other in others if other.is_waiting()]
         if len(waiting) > MAX_WAITING:
             min(waiting, key=lambda other: other.opened).transport.abort()

@@ -65,7 +65,7 @@ class RecordingFindings:
     images: dict[str, CameraImages] = field(default_factory=dict, compare=False)
     """Images of each camera whose recording could be opened; their number may be estimated."""
     recognised: dict[str, set[str]] = field(default_factory=dict)
-    """What the content of keypoints and candidates tells about their form, by kind."""
+    """Recognised layout, numbering and unit of the files, by kind: keypoints or candidates."""
 
     def add_recognised(self, kind: str, texts: Iterable[str]) -> None:
         """Add what was recognised in one camera's files."""

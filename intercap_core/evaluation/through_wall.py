@@ -1,8 +1,8 @@
 """Contact points behind a wall, by a ray cast that does not use :func:`.facing.facing_distance`.
 
-A touched point of an object is behind a wall if every straight way from it to the body within the
-threshold crosses the object or is within it. A touched point inside the body is behind a wall if on
-every steep line through it the body ends sooner on the point's free side than through the object,
+A touched point of an object is behind a wall if every segment from it to the body within the
+threshold crosses the object or lies inside it. A touched point inside the body is behind a wall if
+on every steep line the body's surface is nearer on the point's outer side than through the object,
 like a finger that passed through the wall of a cup.
 """
 
@@ -16,7 +16,7 @@ import trimesh
 from intercap_core import artefacts
 from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
 from intercap_core.evaluation.tracks import read_body, read_object
-from intercap_core.geometry.rigid.distance import DistanceField, o3d
+from intercap_core.geometry.rigid.distance import DistanceField, build_scene, o3d
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.schemas import METRICS
@@ -26,11 +26,11 @@ from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 # can be within the threshold of both of its sides.
 _THIN_M = 2 * CONTACT_M
 _OFF_M = 2e-5  # segments start and end this far from the surfaces
-_LINES = 100  # lines through a point inside the body
-_STEEP = 0.3  # least cosine between a line and the normal: flat ones hardly pass through a wall
+_LINES = 100  # lines through a point inside the body; chosen
+_STEEP = 0.3  # least cosine between a line and the normal, that of contact; tuned
 
 
-def count_walls(paths: SequencePaths, models: SequenceModels) -> np.ndarray:
+def count_behind_wall(paths: SequencePaths, models: SequenceModels) -> np.ndarray:
     """Counts (2,): touched vertices of a thin-walled object, and those of them behind a wall.
 
     They are counted in all frames of a sequence after ``joint``; 0 for other objects. The artefacts
@@ -74,7 +74,10 @@ def behind_wall(
     result = np.zeros(len(points), bool)
     if len(points) == 0:
         return result
-    wall, skin = _scene(*object_), _scene(*body)
+    wall, skin = (
+        build_scene(vertices.astype(np.float32, "C"), faces.astype(np.uint32, "C"), 1)
+        for vertices, faces in (object_, body)
+    )
     solid = DistanceField(*object_, threads=1)
     inside = DistanceField(*body, threads=1).inside(points)
     result[inside] = True
@@ -106,16 +109,6 @@ def _directions(count: int) -> np.ndarray:
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
     flat = np.sqrt(1 - height**2)
     return np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
-
-
-def _scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Return the ray caster of a mesh (V, 3), (F, 3)."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, np.uint32)),
-    )
-    return scene
 
 
 def _first_hit(scene: Any, starts: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -170,7 +170,7 @@ def object_fits(frame: Path) -> list[Path]:
 def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
     """Rotation vectors (55, 3) in SMPL-X's order by time, microseconds; {} without the file."""
     path = folder / BEHAVE_PERSON
-    if not (path.exists() or path.is_symlink()):  # a link to nothing is refused
+    if not (path.exists() or path.is_symlink()):  # a dangling link is refused
         return {}
     values = read_arrays(path, advice="get the file again")
     poses = _as_smplx(_numbers(values, "poses", path), path)

@@ -90,13 +90,13 @@ def check_file(path: Path, limit: int | None, *, advice: str = "check the path")
 
 
 def referenced_files(path: Path) -> list[Path]:
-    """Files next to ``path``, or below, whose names its content holds, and those named in these.
+    """Files in or below the folder of ``path`` that its content names, followed recursively.
 
     Covers materials and textures of a mesh and external weights of an ONNX model without a parser
     of each format. Includes pipes, devices and dangling links, which are not opened.
     """
     found = [path]
-    for file in found:  # which grows
+    for file in found:  # the loop extends the list
         if file.suffix.lower() in _REFERRING and file.is_file():
             with contextlib.suppress(OSError), open(file, "rb") as opened:
                 content = opened.read(_SEARCHED_BYTES)

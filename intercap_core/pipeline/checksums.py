@@ -167,7 +167,7 @@ def find_damage(output: Path) -> str:
             if file_digest(output) == stored[output.name][1]:
                 return ""
             if stored.get(_MANIFEST, ["", ""])[0] == _manifest_text(output):
-                return f"{output}: is not as it was written; delete it and run again"
+                return f"{output}: differs from the file that was written; delete it and run again"
         with artefacts.read(output, getattr(schemas, output.stem.upper())) as source:
             for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
                 shape, _, _, _ = source.describe(key)
@@ -182,7 +182,7 @@ def _find_damaged_file(folder: Path) -> str:
     """Error message about the first file that differs from the folder's manifest, "" if none."""
     manifest = read_manifest(folder)
     if manifest is None or not manifest.outputs:  # or an earlier version wrote it
-        return f"{folder / FILE}: is no list of the folder's files; run again"
+        return f"{folder / FILE}: does not list the folder's files; run again"
     for name, listed in manifest.outputs.items():
         file, size = folder / name, listed.rpartition(":")[2]
         if not file.is_file():
@@ -190,7 +190,7 @@ def _find_damaged_file(folder: Path) -> str:
         if str(file.stat().st_size) != size:
             return f"{file}: has {file.stat().st_size} bytes, it was written with {size}; run again"
         if f"{file_digest(file)}:{size}" != listed:
-            return f"{file}: is not as it was written; delete it and run again"
+            return f"{file}: differs from the file that was written; delete it and run again"
     return ""
 
 
@@ -202,7 +202,7 @@ def read_valid_manifest(output: Path) -> Manifest | None:
     """
     file = output if output.suffix == ".h5" else output / FILE
     try:
-        if not file.is_file():  # missing, a link to nothing, or a pipe, whose reader waits
+        if not file.is_file():  # missing, a dangling link, or a pipe, whose open() blocks
             return None
         file.open("rb").close()
     except (FileNotFoundError, NotADirectoryError):

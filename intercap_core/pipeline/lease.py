@@ -189,7 +189,7 @@ def remove_dead_lock(folder: Path) -> None:
 
     The owner writes a lease into the folder and keeps it until its process ends. The lock stays if
     the lease has a heartbeat, or if another Snakemake or a job of one works in the same directory.
-    A lock without a lease is of another program and stays.
+    A lock without a lease belongs to another program and stays.
     """
     path = folder / "workflow.lease"
     existed = path.exists()
@@ -198,7 +198,7 @@ def remove_dead_lock(folder: Path) -> None:
         path.unlink(missing_ok=True)  # without waiting until it expires
     try:
         lease = try_acquire(path)
-    except UserError:  # a folder that is only read
+    except UserError:  # a read-only folder
         return
     if not isinstance(lease, Lease):
         return
@@ -222,7 +222,7 @@ def find_snakemake(folder: Path) -> int | None:
 
 
 def _is_alive(pid: int) -> bool:
-    """Whether a process of this machine runs; a process that is ended but not reaped does not."""
+    """Whether a process of this machine is alive; zombies are not."""
     import psutil
 
     try:

@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 DATASET = "dataset"
 MARKS = Path(".snakemake") / "out_of_date"
 # Date of a mark after that of its output, less than any job takes: the first that the file system
-# stores as a later date. Some store whole seconds, some even ones.
+# stores as a later date. Some store whole seconds, FAT even seconds.
 _MARK_DELAYS_NS = (1_000_000, 1_000_000_000, 2_000_000_000)
 
 
@@ -156,7 +156,7 @@ class Plan:
         return [mark_of(self.project, sequence, stage)] if self.is_stale(sequence, stage) else []
 
     def mark_all(self) -> None:
-        """Write the marks of all stale outputs, and give outputs dated ahead the current time.
+        """Write the marks of all stale outputs; reset future dates and remove dangling links.
 
         Snakemake lists the folder of the marks once and treats files that are written later as
         missing. After a job, it removes outputs that are older than an input. The date of a mark
@@ -171,7 +171,7 @@ class Plan:
             for file in self._dated_files(name, stage):
                 if file.exists():
                     dated.append(file)
-                elif file.is_symlink():  # to nothing or to itself, at which Snakemake fails
+                elif file.is_symlink():  # dangling or cyclic: Snakemake fails on it
                     log.warning("%s: removed, it was a link to %s", file, os.readlink(file))
                     file.unlink()
             for file in dated:

@@ -114,7 +114,7 @@ def to_plain(value: Any) -> Any:
 
 def read_manifest(output: Path) -> Manifest | None:
     """The manifest of an artefact or folder; None if it has none or it cannot be read."""
-    if not (output if output.suffix == ".h5" else output / FILE).is_file():  # a pipe would wait
+    if not (output if output.suffix == ".h5" else output / FILE).is_file():  # a pipe would block
         return None
     if output.suffix == ".h5":
         with contextlib.suppress(artefacts.Unreadable):

@@ -244,7 +244,7 @@ def _companion_files(path: Path) -> list[Path]:
 
 @functools.cache
 def _referenced(path: Path, stamp: tuple[int, ...]) -> list[Path]:
-    """``referenced_files``, cached; ``stamp`` is that of the file."""
+    """``referenced_files``, cached by ``stamp``: size and date of the file, date of its folder."""
     return referenced_files(path)
 
 

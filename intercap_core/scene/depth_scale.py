@@ -75,7 +75,7 @@ def depth_ratios(depth: np.ndarray, camera: Camera, joints: np.ndarray) -> np.nd
 def describe_factor(ratios: np.ndarray) -> str:
     """Note on the factor of the ratios (N,) of :func:`depth_ratios`; "" if it is 1.
 
-    Several factors are named if some points see an object or a wall at a multiple of the distance.
+    Several factors are named if the depth of some points is that of an object or a wall.
     """
     possible = [factor for factor in FACTORS if _share(ratios, factor) >= MIN_SHARE]
     if len(ratios) < MIN_POINTS or not possible:

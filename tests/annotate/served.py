@@ -19,7 +19,7 @@ import h5py
 import uvicorn
 
 from intercap_core.annotate.annotator import Annotator
-from intercap_core.annotate.server import TOKEN_HEADER, Protocol, application
+from intercap_core.annotate.server import TOKEN_HEADER, LimitedProtocol, application
 from intercap_core.person.sides import swap_sides
 from tests.helpers import fitted_capture as fitted
 
@@ -112,7 +112,7 @@ def served(settings: Path, **options: Any) -> Iterator[Served]:
         listening.bind(("127.0.0.1", 0))
         server = uvicorn.Server(
             uvicorn.Config(
-                application(annotator, TOKEN), log_level="error", ws="none", http=Protocol
+                application(annotator, TOKEN), log_level="error", ws="none", http=LimitedProtocol
             )
         )
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)

@@ -1,4 +1,4 @@
-"""Keypoints and candidates as people have them: public bug reports, and members of each kind."""
+"""Keypoints and candidates of public bug reports, and further cases of each kind."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_the_number_of_an_image_is_found_in_its_name(tmp_path, name_of, remark):
     found = read(tmp_path, camera(12))
     noses = [found.by_image[n][0, 0, 0] for n in range(12)]
     np.testing.assert_allclose(noses, 160 + np.arange(12) / 10)
-    assert [note for note in found.notes] == ([f"keypoint files are {remark}"] if remark else [])
+    assert found.notes == ([f"keypoint files are {remark}"] if remark else [])
 
 
 def test_numbers_that_may_count_from_1_are_noted_and_can_be_stated(tmp_path):

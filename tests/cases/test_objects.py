@@ -1,4 +1,4 @@
-"""Meshes as people have them: inputs of public bug reports, and further members of each kind."""
+"""Meshes of public bug reports, and further cases of each kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings as people have them: inputs that reproduce public bug reports."""
+"""Recordings that reproduce public bug reports."""
 
 from __future__ import annotations
 

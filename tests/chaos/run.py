@@ -52,11 +52,11 @@ def killed(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
         left.remove(job)
         killed_in.append(job)
         print(f"killed in {job[1]} of {job[0] or 'all'}", flush=True)
-    _goes_on(victim)
+    _resume(victim)
     same = identical(victim, undisturbed)
     well = [job for job in killed_in if all(same[name] for name in same if _is_of(name, job))]
     rest = KILLS_BEFORE_JOBS if all(same.values()) else 0
-    _tell(same)
+    _print_differences(same)
     return len(killed_in) + KILLS_BEFORE_JOBS, len(well) + rest
 
 
@@ -86,7 +86,7 @@ def full_disk(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
             print(f"a disk of {size - MORE_ROOM_MB:.0f} MB was full, and it was said", flush=True)
             subprocess.run(["mount", "-o", f"remount,size={size:.0f}m", results], check=True)
         same = identical(victim, undisturbed)
-        _tell(same)
+        _print_differences(same)
         return ended, ended if all(same.values()) else 0
     finally:
         subprocess.run(["umount", results], check=False)
@@ -111,9 +111,9 @@ def damaged(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
         for path in some:
             name = path.relative_to(victim.flow.results)
             print(f"{name}: {damage(path)}", flush=True)
-        _goes_on(victim)
+        _resume(victim)
         same = identical(victim, undisturbed)
-        _tell(same)
+        _print_differences(same)
         done += len(some)
         good += sum(same[path.relative_to(victim.flow.results).as_posix()] for path in some)
     return done, good
@@ -131,9 +131,9 @@ def clock_jumps(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
         time.sleep(half)
         victim.kill(run)
         print(f"killed by a clock {days:+d} days off", flush=True)
-    _goes_on(victim)
+    _resume(victim)
     same = identical(victim, undisturbed)
-    _tell(same)
+    _print_differences(same)
     return 2, 2 if all(same.values()) else 0
 
 
@@ -151,16 +151,18 @@ def dates(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
             for path in folder.rglob("*"):
                 os.utime(path, (date, date))
         print(f"all files dated {days:+d} days", flush=True)
-        _goes_on(victim)
+        _resume(victim)
         same = identical(victim, undisturbed)
-        _tell(same)
+        _print_differences(same)
         good += all(same.values())
     return 2, good
 
 
 def deliverables(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
-    """Files of exports, pages, tables, card and site, and artefacts, of which each is damaged,
-    replaced, or made to unpack to gigabytes; returns how many, and how many were made again."""
+    """Damage, replace or inflate files of exports, pages, tables, card, site, and artefacts.
+
+    Returns the number of files, and how many of them ``intercap run`` restored.
+    """
     shutil.copytree(undisturbed.flow.results, victim.flow.results)
     results = victim.flow.results
     patterns = ("*/export/**/*", "site/sequences/**/*", "site/*", "tables/*", "*.*", "*/*.h5")
@@ -180,13 +182,13 @@ def deliverables(undisturbed: Victim, victim: Victim) -> tuple[int, int]:
         chosen[path] = bomb
     for path, change in chosen.items():
         print(f"{path.relative_to(results)}: {change(path)}", flush=True)
-    _goes_on(victim)
+    _resume(victim)
     same = identical(victim, undisturbed)
-    _tell(same)
+    _print_differences(same)
     return len(chosen), sum(same[path.relative_to(results).as_posix()] for path in chosen)
 
 
-def _goes_on(victim: Victim) -> None:
+def _resume(victim: Victim) -> None:
     status, said = victim.go_on()
     if status:
         raise Fault(f"the run did not go on:\n{said[-4000:]}")
@@ -206,7 +208,7 @@ def _is_of(name: str, job: tuple[str, str]) -> bool:
     return name.startswith(places.get(stage, f"{sequence}/{stage}.h5"))
 
 
-def _tell(same: dict[str, bool]) -> None:
+def _print_differences(same: dict[str, bool]) -> None:
     other = sorted(name for name in same if not same[name])
     print(f"{len(same)} files, {len(other)} of them not identical {other[:8] or ''}", flush=True)
 
@@ -239,7 +241,7 @@ def main() -> int:
     tried = survived = 0
     with tempfile.TemporaryDirectory() as folder:
         undisturbed = _copy(Path(folder), "undisturbed")
-        _goes_on(undisturbed)
+        _resume(undisturbed)
         for name in arguments.rounds:
             run, missing = ROUNDS[name]
             if missing:

@@ -105,7 +105,7 @@ def test_a_result_is_known_again_until_it_changes(summary: Path) -> None:
     assert not is_unchanged(summary) and find_damage(summary) == ""
     with summary.open("ab") as file:  # which no checksum lies over
         file.write(b"more")
-    assert "is not as it was written" in find_damage(summary)
+    assert "differs from the file that was written" in find_damage(summary)
     remember_output(summary)
     assert is_unchanged(summary)
     (summary.with_name(f".{summary.name}.left")).write_text("[1, ")
@@ -131,7 +131,10 @@ def test_flipped_bits_and_truncation_are_detected(summary: Path, share: float) -
     ("fault", "words"),
     [
         (lambda file: file.write_bytes(b"numb"), "has 4 bytes, it was written with 7;"),
-        (lambda file: file.write_bytes(b"NUMBERS"), "is not as it was written; delete it and"),
+        (
+            lambda file: file.write_bytes(b"NUMBERS"),
+            "differs from the file that was written; delete it and",
+        ),
         (lambda file: file.unlink(), "is missing;"),
         (lambda file: (file.unlink(), file.mkdir()), "is missing;"),
         (lambda file: (file.unlink(), file.symlink_to("none")), "is missing;"),

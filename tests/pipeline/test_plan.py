@@ -439,7 +439,7 @@ def test_a_folder_without_a_list_of_its_files_is_made_again(
     assert _pending() == _of(ONE, "page") | DATASET
     assert not print_verification(project)
     printed = capsys.readouterr().out
-    assert printed.count("is no list of the folder's files; run again") == 2
+    assert printed.count("does not list the folder's files; run again") == 2
     assert "delete" not in printed
 
 

@@ -120,7 +120,7 @@ def inputs_of(stage):
 def files_of(stage):
     """Param: path, size and date of the user's files that a stage reads, without the studio's.
 
-    The executor for Slurm adopts no job whose files have changed. They are no inputs: Snakemake
+    The executor for Slurm does not adopt jobs whose files have changed. Files are not inputs: Snakemake
     fails the job of an input that is dated ahead of the clock and removes its output.
     """
 

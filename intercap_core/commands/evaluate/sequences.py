@@ -20,7 +20,7 @@ from intercap_core.commands.evaluate.part import (
 )
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.through_wall import count_walls
+from intercap_core.evaluation.through_wall import count_behind_wall
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
@@ -66,7 +66,7 @@ class MeasuredSequence:
     metrics: SequenceMetrics
     annotated: bool
     """Whether the sequence has annotations."""
-    walls: np.ndarray
+    behind_wall: np.ndarray
     """(2,) touched vertices of a thin-walled object, and those of them behind a wall."""
 
 
@@ -77,7 +77,9 @@ def measure(project: Project, sequence: str) -> MeasuredSequence:
     """Read the metrics of one recording."""
     made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
     paths, models = project.paths(sequence), project.models(sequence)
-    return MeasuredSequence(SequenceMetrics.read(paths.metrics), made, count_walls(paths, models))
+    return MeasuredSequence(
+        SequenceMetrics.read(paths.metrics), made, count_behind_wall(paths, models)
+    )
 
 
 def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
@@ -166,7 +168,7 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
         for key, value in with_spread(flat_areas, sequences).items():
             area, _, name = key.partition(".")
             found[f"{area}{suffix}.{name}"] = value
-    touched, behind = sum((e.walls for m in evaluations for e in m.errors), np.zeros(2))
+    touched, behind = sum((e.behind_wall for m in evaluations for e in m.errors), np.zeros(2))
     if touched:
         found["contact.through_wall_share"] = float(behind / touched)
     if "joint_annotated.contact_detected_f1" in found:

@@ -150,7 +150,7 @@ def to_calibration(
         scale: metres for one unit of the file, as the user states it.
         unit: why the file's unit of length is unknown, as a clause for the message; None if the
             file is in metres.
-        as_stored: whether the tool leaves the Exif orientation of image files aside.
+        as_stored: whether the tool ignores the Exif orientation of image files.
     """
     if not cameras:
         raise UserError(f"{path}: holds no camera; calibrate again, or name another file")

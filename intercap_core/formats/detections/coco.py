@@ -90,7 +90,7 @@ class DetectionPreview:
     labels: set[str] = field(default_factory=set)
     """Labels of the instances; empty for keypoints."""
     recognised: list[str] = field(default_factory=list)
-    """What was recognised by the content."""
+    """Properties recognised by content: layout, numbering, unit."""
 
 
 CandidateFile = DetectionFile[Instance]

@@ -33,9 +33,9 @@ FILES_NAMED = 3  # broken files or entries that a note names; the others are onl
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
 _NUMBERS = re.compile(r"\d{1,25}")
 _DECIMALS = re.compile(r"\d{1,15}(?:\.\d{1,9})?")
-# Least share of the images that have a number, for numbers that count from another number than 0.
+# Least share of the images that have a number, for numbers that count from 1; chosen.
 MIN_SHARE_SHIFTED = 0.5
-# Largest deviation of times from the images' times, in steps between two images.
+# Largest deviation of times from the images' times, in steps between two images; chosen.
 MAX_TIME_ERROR = 0.25
 
 
@@ -93,7 +93,7 @@ class CameraImages:
     ) -> tuple[dict[str, int], dict[float, int], str]:
         """Image numbers of the names and of the ids in one file, and a remark on their numbering.
 
-        Names count before ids. There are no image numbers of names if the ids fit more images.
+        Names take precedence. If the ids match more images, the mapping of names is empty.
         """
         by_name, remark = self.recognise_names(names)
         matched, remark_on_ids = self.match_numbers(ids)
@@ -101,7 +101,7 @@ class CameraImages:
         known_ids = self.recorded.intersection(by_id.get(n, n) for n in ids)
         known_names = self.recorded.intersection(by_name.values())
         if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
-            by_name = {}  # the numbers in the names are something else
+            by_name = {}  # the numbers in the names do not number the images
         return by_name, by_id, remark if by_name else remark_on_ids or self.remark_on_start(ids)
 
     def match_numbers(self, numbers: Collection[float]) -> tuple[dict[float, int] | None, str]:
@@ -159,7 +159,8 @@ class CameraImages:
             return ""
         return (
             f"read as numbered from {min(self.recorded)}, but begin at {min(given):.0f}: "
-            "set detections.keypoint_first_number or candidate_first_number if they count from it"
+            "set detections.keypoint_first_number or candidate_first_number if this is the first "
+            "image"
         )
 
 

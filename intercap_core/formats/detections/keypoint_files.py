@@ -132,7 +132,7 @@ class PeopleByImage:
     notes: list[str] = field(default_factory=list)
     """Messages for the user about people and files that were left out."""
     recognised: list[str] = field(default_factory=list)
-    """What was recognised by the content: layout, numbering, unit."""
+    """Properties recognised by content: layout, numbering, unit."""
 
 
 @dataclass
@@ -199,7 +199,7 @@ class _Reading:
         self._scale_shares()
         cleaner = KeypointCleaner(self.images.size, full_confidence)
         by_image = {number: cleaner.clean(people) for number, people in self.raw.items()}
-        # A layout that fits is no news for the artefact; `check` reports it.
+        # Only `intercap check` reports a default layout that fits; the artefact has no note.
         recognised = list(dict.fromkeys(self.recognised))
         notes += [text for text in recognised if not text.startswith("layout ")]
         notes += cleaner.notes()
@@ -282,9 +282,9 @@ def find_image_files(folder: Path) -> tuple[dict[str, Path], KeypointReader] | N
 
     None if the folder has no such file.
     """
-    visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for reader in readers():
-        matched = reader.match_images(sorted(visible))
+        matched = reader.match_images(sorted(paths))
         if matched:
             return matched, reader
     return None

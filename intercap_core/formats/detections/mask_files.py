@@ -85,7 +85,7 @@ def _decode(content: bytes, numbered: bool) -> np.ndarray:
             is_void = (indices == 255) & bool(((indices > 0) & (indices < 255)).any())
             return np.where(is_void, 0, indices).astype(np.uint16)
         image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
-    except (cv2.error, OSError, SyntaxError, ValueError):  # or it takes too much memory
+    except (cv2.error, OSError, SyntaxError, ValueError):  # damaged, or too large to decode
         image = None
     if image is None:
         raise DamagedImage("is no image")

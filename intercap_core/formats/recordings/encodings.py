@@ -1,6 +1,6 @@
 """Encodings of single colour images: size, orientation, and the form in which an image is stored.
 
-Stored is a whole JPEG or PNG file without an orientation, so that every reader of the frames
+Stored files are whole JPEG or PNG files without an orientation, so that every reader of the frames
 artefact (OpenCV, a browser, FFmpeg) shows the same pixels. JPEG: ITU-T T.81, annex B; PNG: RFC 2083
 with the chunk eXIf; Exif: CIPA DC-008, 4.6; TIFF: revision 6.0.
 """
@@ -24,7 +24,7 @@ RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 
 OrientationUse = Literal["turn", "ignore", "refuse"]
-"""What is done with an image that states an orientation: turn its pixels, as OpenCV and FFmpeg do;
+"""Treatment of an image that states an orientation: turn its pixels, as OpenCV and FFmpeg do;
 keep them as stored; or refuse half turns and mirrors, because depth would not follow them."""
 
 
@@ -107,7 +107,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
         elif content.startswith(PNG_START):
             whole = encode_jpeg(_decode_8_bit(content))
         remarks.append(
-            f"state orientation {orientation}, which the calibration leaves aside: used as stored"
+            f"state orientation {orientation}, which the calibration ignores: used as stored"
         )
         return whole, "; ".join(remarks)
     if orientation_use == "refuse" and orientation < 5:
@@ -199,7 +199,7 @@ def _parse_jpeg(content: bytes) -> _Jpeg | None:
 
 
 def _complete_jpeg(content: bytes) -> bytes:
-    """Add the missing end marker of a JPEG file; raises :class:`DamagedImage` if more is cut."""
+    """Add a JPEG file's missing end marker; raises :class:`DamagedImage` if pixels are missing."""
     content += b"\0" * content.endswith(b"\xff")  # half of a marker, or of a stuffed byte
     if not holds_all_pixels(content + JPEG_END):
         raise DamagedImage("is cut off")

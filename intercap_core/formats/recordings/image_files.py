@@ -27,6 +27,7 @@ from intercap_core.formats.recordings.encodings import (
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.inputs.files import MAX_IMAGE_BYTES, UnreadableFile, read_bytes
 
 
@@ -34,7 +35,7 @@ class Decoding(NamedTuple):
     """How a camera's image files are read."""
 
     orientation: OrientationUse = "turn"
-    """What is done with colour images that state an orientation."""
+    """Treatment of colour images that state an orientation."""
     depth_unit_m: float = 0.001
     """Metres for one unit of the depth files."""
 
@@ -98,9 +99,7 @@ def _check_depth_head(content: bytes, size: tuple[int, int]) -> None:
 
 def _check_depth_size(actual: tuple[int, ...], size: tuple[int, int]) -> None:
     if actual != size:
-        raise DamagedImage(
-            f"has {actual[0]}x{actual[1]} pixels, the colour images {size[0]}x{size[1]}"
-        )
+        raise DamagedImage(f"has {actual[0]}x{actual[1]} pixels, expected {size[0]}x{size[1]}")
 
 
 def read_content(path: Path, length: int | None = None) -> bytes:
@@ -170,7 +169,7 @@ def inspect_files(
     ``lens`` is that of the depth camera; None = depth is not used.
 
     Returns:
-        Faults, that is empty files and damaged ones among a few, and remarks on the others.
+        Faults (empty files, and damaged ones among five inspected), and remarks on the others.
     """
     faults = []
     remarks: Counter[str] = Counter()
@@ -184,8 +183,7 @@ def inspect_files(
                 f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
             )
         bad = []
-        chosen = np.unique(np.linspace(0, len(paths) - 1, 5).round().astype(int))
-        chosen = chosen[: len(paths)].tolist()  # evenly over the recording
+        chosen = sample_evenly(np.ones(len(paths), bool), 5).tolist()
         for index in chosen:
             try:
                 if kind == "colour":
@@ -203,9 +201,9 @@ def inspect_files(
             faults.append(
                 f"{len(bad)} of {len(chosen)} inspected {kind} files are damaged (first: {bad[0]})"
             )
-    looked = sum(remarks.values())
+    inspected = sum(remarks.values())
     return faults, [
-        f"{count} of {looked} inspected colour images {remark}"
+        f"{count} of {inspected} inspected colour images {remark}"
         for remark, count in remarks.items()
         if remark
     ]
@@ -290,7 +288,7 @@ class AlignedRecording(FilesRecording):
         Raises UserError if none can be read.
         """
         paths = [shot.depth for shot in self._shots if shot.depth is not None]
-        chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int))
+        chosen = sample_evenly(np.ones(len(paths), bool), count)
         images = []
         for index in chosen.tolist():
             with contextlib.suppress(DamagedImage):

@@ -37,7 +37,7 @@ class RecordingPreview(NamedTuple):
     faults: tuple[str, ...] = ()
     """Other faults; each follows the camera's name in a message."""
     remarks: tuple[str, ...] = ()
-    """What is changed when images are stored; the same form."""
+    """Changes to images when they are stored; each follows the camera's name in a message."""
     counted: bool = True
     """Whether images were counted; otherwise they follow from duration and rate."""
 

@@ -113,7 +113,7 @@ class DistanceField:
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"vertices {vertices.shape} and faces {faces.shape} are no mesh")
         self.box = np.array([vertices.min(0), vertices.max(0)], np.float64)
-        self._scene = _scene(vertices, faces, threads)
+        self._scene = build_scene(vertices, faces, threads)
         self._open = None if watertight else _OpenSurface(vertices, faces, threads)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
@@ -202,7 +202,7 @@ class SurfacePart:
         if not spanned.any():
             raise ValueError(f"vertices {part.tolist()} are corners of no face")
         self._whole, self.box = whole, whole.box
-        self._scene = _scene(
+        self._scene = build_scene(
             np.ascontiguousarray(vertices, np.float32),
             np.ascontiguousarray(faces[spanned], np.uint32),
             threads=0,
@@ -234,7 +234,7 @@ class _OpenSurface:
         self._faces = faces.astype(np.int64)
         self._low, self._high = vertices.min(0), vertices.max(0)
         hull = trimesh.convex.convex_hull(self._vertices)
-        self._hull = _scene(
+        self._hull = build_scene(
             np.asarray(hull.vertices, np.float32), np.asarray(hull.faces, np.uint32), threads
         )
 
@@ -267,7 +267,7 @@ class _OpenSurface:
         return Closest(place, closest.faces, closest.barycentric, normals)
 
 
-def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> Any:
+def build_scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> Any:
     """Return the search tree of float32 vertices (V, 3) and uint32 faces (F, 3)."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))

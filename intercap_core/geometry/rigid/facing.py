@@ -49,18 +49,18 @@ def facing_distance(
     along = (end - start) / np.maximum(away, _OFF_M)[:, None]
     start, end = start + _OFF_M * along, end - _OFF_M * along
     # nothing lies between a point and the nearest point of a surface that it has penetrated
-    asked = (another | (nearest & outside)) & (away > 2 * _OFF_M)
-    blocked = _blocked(own, start, end, asked)
-    blocked |= _blocked(other, start, end, asked & another & ~behind)
+    tested = (another | (nearest & outside)) & (away > 2 * _OFF_M)
+    blocked = _blocked(own, start, end, tested)
+    blocked |= _blocked(other, start, end, tested & another & ~behind)
     value = np.where(nearest, signed[near], np.where(behind, -away, away))
     distance[near] = np.where((kind > 0) & ~blocked, value, np.inf)
     return distance
 
 
 def _blocked(
-    surface: ShapedSurface, start: np.ndarray, end: np.ndarray, asked: np.ndarray
+    surface: ShapedSurface, start: np.ndarray, end: np.ndarray, tested: np.ndarray
 ) -> np.ndarray:
-    """Mask (N,) of the ``asked`` (N,) segments ``start`` to ``end`` (N, 3) that hit a surface."""
-    blocked = ~asked
+    """Mask (N,) of the ``tested`` (N,) segments ``start`` to ``end`` (N, 3) that hit a surface."""
+    blocked = ~tested
     surface.blocks(start, end, blocked)
-    return blocked & asked
+    return blocked & tested

@@ -244,14 +244,14 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def _check_symmetry(path: Path, mesh: ObjectMesh) -> None:
-    """Raise UserError if a symmetry moves the centre of mass, which it keeps in place."""
+    """Raise UserError if a symmetry moves the centre of mass by over half of the extent."""
     centre, symmetry = mesh.centre_of_mass, mesh.symmetry
     elements = symmetry.elements(4)
     moved = np.linalg.norm(elements[:, :3, :3] @ centre + elements[:, :3, 3] - centre, axis=1).max()
     if symmetry.sphere:
         moved = max(moved, 2 * float(np.linalg.norm(centre)))
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    if moved > 0.5 * extent:  # scans and symmetries of appearance are off by less
+    if moved > 0.5 * extent:  # scans and symmetries of appearance deviate by less
         raise UserError(
             f"object {mesh.name!r}: its symmetry moves the centre of {path} by {moved:.3g} m, "
             f"expected less than {0.5 * extent:.2g} m; correct the offset or translation of the "

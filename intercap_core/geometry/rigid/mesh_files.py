@@ -165,7 +165,7 @@ class _FolderResolver(trimesh.resolvers.Resolver):
 
 @contextmanager
 def _silent_trimesh() -> Iterator[None]:
-    """Keep trimesh's log, which repeats errors in its own words, off the terminal."""
+    """Disable trimesh's log, which repeats errors that are reported as UserError."""
     log = logging.getLogger("trimesh")
     before, log.disabled = log.disabled, True
     try:

@@ -10,7 +10,7 @@ import numpy as np
 
 from intercap_core.annotation import ANY_REGION, ContactInterval
 
-# Least probability at which distance and slip without the annotation contradict a statement.
+# Least probability, by distance and slip alone, at which the fit contradicts a statement; chosen.
 CONTRADICTED = 0.95
 
 
@@ -76,8 +76,8 @@ def find_issues(
 ) -> list[AnnotationIssue]:
     """Find annotated intervals that have no frames, or that the fit contradicts.
 
-    Frames in which the fit is free of a part that is stated to touch, and frames in which it
-    touches a part that is stated to be free.
+    The fit contradicts an annotation if it has no contact of a part that is stated to touch, or
+    contact of a part that is stated to be free.
 
     Args:
         evidence: (T, R) of the annotation.
@@ -104,7 +104,7 @@ def find_issues(
     touching = (detected > CONTRADICTED) & (evidence < 0) & ~unseen[:, None]
     for r, region in enumerate(regions):
         for run in _runs(touching[:, r]):
-            text = f"{region} annotated as free, and the fit touches the object with it"
+            text = f"{region} annotated as free of contact, but it touches the object in the fit"
             issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
     return issues
 

@@ -197,7 +197,7 @@ SURVIVED = [
      "no depth used: 00000.png is no 16-bit grey PNG (8 bits", True, 5, False),
     (overwrite(f"{DEPTH_2}/00001.png", GREY), "00001.png is no 16-bit grey PNG", True, 5, True),
     (overwrite(f"{DEPTH_2}/*.png", np.full((64, 80), 1000, np.uint16)),
-     "has 80x64 pixels, the colour images 192x108", True, 5, False),
+     "has 80x64 pixels, expected 192x108", True, 5, False),
     (overwrite(f"{COLOUR_2}/*.jpg", np.zeros((72, 128, 3), np.uint8)),
      "the images have 128x72", False, 0, False),
     (remove(COLOUR_2), "no readable color/<number>.jpg", False, 0, False),

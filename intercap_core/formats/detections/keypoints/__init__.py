@@ -160,12 +160,12 @@ _BONES = [
     ("mid_hip", "left_hip"), ("mid_hip", "right_hip"),
 ]  # fmt: skip
 MAX_COMPARED = 2000  # people of a camera; one takes 30 kB at the peak (tracemalloc, 20,000 people)
-BONE_QUANTILE = 0.75  # a point that is far off spoils the few bones that end in it
+BONE_QUANTILE = 0.75  # a few bones with a misplaced end do not change it
 _BONE_ENDS = np.array([[KEYPOINT_INDEX[end] for end in bone] for bone in _BONES])
 
 
 def visible(points: np.ndarray) -> np.ndarray:
-    """Mask (...) of points (..., 3) with finite x, y off the corner and a confidence above 0."""
+    """Mask (...) of points (..., 3) that are finite, not at (0, 0), and of confidence above 0."""
     with np.errstate(invalid="ignore"):
         return np.isfinite(points).all(-1) & (points[..., 2] > 0) & (points[..., :2] != 0).any(-1)
 
@@ -183,7 +183,8 @@ def compare_bones(people: np.ndarray) -> float | None:
     seen = visible(body)
     points = np.where(seen[..., None], body[..., :2], np.nan)[seen.sum(1) >= 8]
     extent = np.nanmax(points, axis=1, initial=-np.inf) - np.nanmin(points, axis=1, initial=np.inf)
-    points = points[extent.min(-1) > 0.02 * extent.max(-1)]  # points on a line show no bones
+    # collinear points do not determine a layout
+    points = points[extent.min(-1) > 0.02 * extent.max(-1)]
     if not len(points):
         return None
     if len(points) > MAX_COMPARED:
