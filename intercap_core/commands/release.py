@@ -88,10 +88,9 @@ def check_release(folder: Path) -> bool:
 
 def _check_complete(project: Project) -> None:
     """Raise UserError that names the sequences with damaged or missing outputs."""
-    plan = Plan(project)
     broken = {}
-    for name in ("", *project.sequences):
-        faults = [*plan.faults(name).values()]
+    for name, by_stage in Plan(project).all_faults().items():
+        faults = [*by_stage.values()]
         last = project.artefact(name, "summary") if name else project.site / "index.html"
         if not faults and not last.exists():
             faults = [f"{last}: is missing; run again"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +15,8 @@ from intercap_core.inputs.files import printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.plan import OutputState, OutputStatus, Plan
-from intercap_core.progress import Progress
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
-
-log = logging.getLogger(__name__)
 
 ROWS = 40  # printed sequences that are not done
 DONE, RUNNING, FAILED, STALE, MISSING = "done", "running", "failed", "out of date", "missing"
@@ -195,13 +191,8 @@ def _to_json(current: Status) -> dict[str, object]:
 
 def print_verification(project: Project) -> bool:
     """Read every output and print the damaged and missing ones; True if there are none."""
-    plan = Plan(project)
-    sequences = ["", *project.sequences]
-    progress = Progress(log, "verified", len(sequences), "sequences")
-    faults: list[str] = []
-    for name in sequences:
-        faults += plan.faults(name).values()
-        progress.step()
+    by_sequence = Plan(project).all_faults().values()
+    faults = [words for by_stage in by_sequence for words in by_stage.values()]
     for words in faults:
         print(printable(words))
     print(f"{len(project.sequences)} sequences read, {len(faults)} outputs damaged or missing")

@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 
 from intercap_core.errors import UserError
+from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.pipeline.checksums import (
     INPUTS_FILE,
     InputChecksums,
@@ -32,6 +33,7 @@ from intercap_core.pipeline.stage_inputs import (
     stage_manifest,
     studio_manifest,
 )
+from intercap_core.progress import Progress
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
@@ -121,6 +123,18 @@ class Plan:
             for stage in (stages if existing else ())
         }
         return {stage: fault for stage, fault in faults.items() if fault}
+
+    def all_faults(self) -> dict[str, dict[str, str]]:
+        """Result of :meth:`faults` by sequence, "" included; files are read in several threads."""
+        names = ["", *self.project.sequences]
+        progress = Progress(log, "read", len(names), "sequences")
+
+        def read(name: str) -> dict[str, str]:
+            found = self.faults(name)
+            progress.step()
+            return found
+
+        return dict(zip(names, ThreadPool(os.cpu_count() or 1).map(read, names), strict=True))
 
     def all_done(self) -> bool:
         """Whether every output of the project is up to date."""
