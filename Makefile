@@ -85,13 +85,13 @@ mediapipe: $(MEDIAPIPE)/.installed
 # without MediaPipe (Python 3.13 and later), the area detector is left out
 evaluate: $(STAMP)
 	-$(MAKE) --no-print-directory mediapipe
-	$(BIN)/intercap evaluate --cores $(CORES)
+	$(BIN)/intercap dev evaluate --cores $(CORES)
 
 evaluate-quick: $(STAMP)
-	$(BIN)/intercap evaluate --quick --output results/evaluation-quick.json --cores $(CORES)
+	$(BIN)/intercap dev evaluate --quick --output results/evaluation-quick.json --cores $(CORES)
 
 bench: $(STAMP)
-	$(BIN)/intercap bench --cores $(CORES)
+	$(BIN)/intercap dev bench --cores $(CORES)
 	$(BIN)/python -m bench.object_speed
 	$(BIN)/python -m bench.body_speed
 	$(BIN)/python -m bench.joint_speed
@@ -125,7 +125,7 @@ chaos: $(STAMP)
 	$(BIN)/python -m tests.chaos.run
 
 docs: $(STAMP)
-	$(BIN)/intercap docs
+	$(BIN)/intercap dev docs
 	$(BIN)/python tools/write_rule_graph.py
 
 environment: $(STAMP)

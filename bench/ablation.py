@@ -22,10 +22,10 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
 
 from bench.again import artefacts_of, check_run, compute_once, slug
 from bench.command import exit_on_user_error
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.config import JointSettings
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.joint.problem import TERMS
@@ -189,12 +189,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         names = options.sequences or list(load_project(options.settings).sequences)
         variants = options.variants or list(VARIANTS)
         figures = ablate(options.settings, names, variants, options.folder)
-    variant = Column("variant", no_wrap=True)
-    table = Table(variant, *(measure.title for measure in MEASURES), box=None)
+    table = ListTable("variant", *(measure.title for measure in MEASURES))
     for row in rows(figures):
         table.add_row(*row)
-    console = Console()
-    console.width = max(console.width, 170)
+    console = standard_console()
     console.print(table)
     section = options.folder / "RESULTS.md"
     section.write_text(markdown(figures, options.settings, names), encoding="utf-8")

@@ -2,7 +2,8 @@
 
     python -m bench.body_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Needs the artefacts of ``intercap bench``. Both methods read the same keypoints, clouds and cameras
+Needs the artefacts of ``intercap dev bench``.
+Both methods read the same keypoints, clouds and cameras
 of the first sequence, decoded in advance, start from the same triangulated joints and use the same
 number of threads. The recipe is measured as published, with all its stages in every frame, and in
 its fastest form: each frame continues from the frame before with the last stage only, and stops
@@ -29,9 +30,7 @@ from bench.timing import THREADS, first_as_good  # before the numerical librarie
 
 import numpy as np
 import torch
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
 from bench.body_baseline import STAGES, FrameFit, fit_by_lbfgs
@@ -44,6 +43,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.start import place_trunk
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 
@@ -196,10 +196,8 @@ def _milliseconds_an_evaluation(fits: list[FrameFit]) -> float:
 
 
 def _print(title: str, rows: dict[str, Run], figures: dict[str, float]) -> None:
-    console = Console()
-    table = Table(
-        "body", "ms a frame", "times ours", "mm a vertex", "worst frame", title=title, box=None
-    )
+    console = standard_console()
+    table = ListTable("body", "ms a frame", "times ours", "mm a vertex", "worst frame", title=title)
     least = next(iter(rows.values())).seconds
     for name, run in rows.items():
         table.add_row(
@@ -212,7 +210,7 @@ def _print(title: str, rows: dict[str, Run], figures: dict[str, float]) -> None:
         f"{figures['speedup_accuracy']:.0f} over its quickest way",
         highlight=False,
     )
-    forward = Table(f"body model, {BATCH} bodies", "forward, ms", "with gradient, ms", box=None)
+    forward = ListTable(f"body model, {BATCH} bodies", "forward, ms", "with gradient, ms")
     for name, key in (
         ("ours", "forward"),
         ("body-models", "forward_body_models"),

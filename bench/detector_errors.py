@@ -24,11 +24,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 from scipy.stats import spearmanr
 
 from bench.command import exit_on_user_error
-from intercap_core.commands.evaluate.part import console_of, number
+from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.evaluate.part import number
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.rig import Rig
@@ -194,11 +194,11 @@ def main() -> None:
         names = list(options.sequences) or list(project.sequences)
         made_by = load_project(options.studio or options.settings)
         recordings = [measure(project, name, made_by) for name in names]
-    table = Table("points", *COLUMNS, box=None, title=f"{options.settings}, mm")
+    table = ListTable("points", *COLUMNS, title=f"{options.settings}, mm")
     for name, points in groups().items():
         row = figures(recordings, points)
         table.add_row(name, *(number(v, d) for v, d in zip(row, DIGITS, strict=True)))
-    console_of(110).print(table)
+    standard_console().print(table)
 
 
 if __name__ == "__main__":

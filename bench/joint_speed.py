@@ -2,7 +2,7 @@
 
     python -m bench.joint_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Needs the artefacts of ``intercap bench``. Both methods refine the whole first sequence from the
+Needs the artefacts of ``intercap dev bench``. Both methods refine the whole first sequence from the
 same sequential fits, keypoints, clouds, crops and cameras, with the same number of threads. The
 stage is timed with reading and writing of files, without the start of its process. The recipe
 starts from inputs in memory and is timed over ``--steps`` steps, and until the truth says that it
@@ -22,13 +22,12 @@ from bench.timing import AS_GOOD, THREADS, first_as_good  # before the numerical
 # isort: split
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from bench.clips import JointClip, JointErrors, read_state
 from bench.command import add_figures, from_command_line
 from bench.joint_baseline import STEPS, Energy, refine
 from bench.stage_resources import peak_memory_mb
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
@@ -108,7 +107,7 @@ def _errors(prefix: str, errors: JointErrors) -> dict[str, float]:
 
 
 def _known(output: Path, key: str) -> dict[str, float]:
-    """The figure of ``intercap bench`` that is in the output, which this area would replace."""
+    """The figure of ``intercap dev bench`` that is in the output, which this area would replace."""
     known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
     return {key.partition(".")[2]: known[key]} if key in known else {}
 
@@ -116,9 +115,9 @@ def _known(output: Path, key: str) -> dict[str, float]:
 def _print(
     title: str, rows: dict[str, tuple[float, int, JointErrors]], figures: dict[str, float]
 ) -> None:
-    console = Console()
+    console = standard_console()
     heads = ("joint", "seconds", "times ours", "steps", "body, mm", "object, mm", "mean")
-    table = Table(*heads, title=title, box=None)
+    table = ListTable(*heads, title=title)
     for name, (seconds, steps, errors) in rows.items():
         table.add_row(
             name, f"{seconds:.1f}", f"{seconds / rows['ours'][0]:.1f}", str(steps or ""),

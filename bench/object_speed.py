@@ -2,7 +2,8 @@
 
     python -m bench.object_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Needs the artefacts of ``intercap bench``. On its first sequence shorter schedules of the baseline
+Needs the artefacts of ``intercap dev bench``.
+On its first sequence shorter schedules of the baseline
 are measured too. Then tracker and recipe are compared on ``--frames`` frames of one recording of
 each object (config/object; recordings that do not exist are made). Both get the same frames,
 decoded and reduced in advance, the same first pose (the true pose with an error of 10 mm and 5
@@ -24,13 +25,12 @@ from bench.timing import AS_GOOD, NEAR_BEST, THREADS  # before the numerical lib
 # isort: split
 import numpy as np
 import torch
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from bench.clips import ObjectClip
 from bench.command import add_figures, from_command_line
 from bench.object_baseline import FrameFit, Recipe, fit_by_adam
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
@@ -290,7 +290,7 @@ def print_compared(found: Mapping[str, tuple[Run, Run]]) -> None:
     """Print one row per object and one of all frames; ours, then the recipe."""
     ours, recipe = (Run.pooled([pair[i] for pair in found.values()]) for i in (0, 1))
     heads = ("mm (p95)", "degrees (p95)", "lost", "ms")
-    table = Table("object", *heads, *(f"recipe: {head}" for head in heads), box=None)
+    table = ListTable("object", *heads, *(f"recipe: {head}" for head in heads))
     table.title = f"the whole track and the paper's recipe, {ours.frames} frames"
     for name, pair in {**found, "all": (ours, recipe)}.items():
         cells = []
@@ -298,8 +298,7 @@ def print_compared(found: Mapping[str, tuple[Run, Run]]) -> None:
             cells += ["{:.2f} ({:.2f})".format(*e) for e in (run.translation_mm, run.rotation_deg)]
             cells += [f"{run.lost:.3f}", f"{run.ms:.0f}"]
         table.add_row(name, *cells)
-    console = Console()
-    console.width = max(console.width, 130)
+    console = standard_console()
     console.print(table)
 
 
@@ -311,10 +310,10 @@ def _print(
     reached: Run,
     figures: dict[str, float],
 ) -> None:
-    console = Console()
-    table = Table(
+    console = standard_console()
+    table = ListTable(
         "tracking", "ms a frame", "times ours", "mm (p95)", "degrees (p95)", "lost",
-        title=title, box=None,
+        title=title,
     )  # fmt: skip
 
     def row(name: str, run: Run) -> None:

@@ -42,7 +42,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when the libraries start
 
 import numpy as np
 import trimesh
-from rich.table import Column, Table
 from scipy.spatial import cKDTree
 
 from bench.again import artefacts_of, check_run, compute_once, slug
@@ -50,7 +49,8 @@ from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.commands.bench import replace_figures
-from intercap_core.commands.evaluate.part import console_of, number
+from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.evaluate.part import number
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
@@ -387,9 +387,9 @@ def flat(found: Found) -> Figures:
 
 def print_tables(found: Found) -> None:
     """A table of all sequences and one of each object, and the joint stage's figures in words."""
-    console = console_of(WIDTH)
+    console = standard_console()
     for title, variants in {"all": by_variant(found), **by_object(found)}.items():
-        table = Table(Column("put in", no_wrap=True), *MEASURES, title=title, box=None)
+        table = ListTable("put in", *MEASURES, title=title)
         for variant, some in variants.items():
             cells = (number(some.get(key), 2) for key in MEASURES.values())
             table.add_row(variant, *cells)

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy.stats import binom, spearmanr
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import WITHIN, stated_errors
@@ -135,9 +134,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    console = Console()
+    console = standard_console()
     columns = ("part", "kind", "sequences", "rank", f"within {WITHIN:g}", "covered", "true/stated")
-    table = Table(*columns, title="stated against true, of kinds that were left out", box=None)
+    table = ListTable(*columns, title="stated against true, of kinds that were left out")
     for part, samples in parts.items():
         found, stated = calibrate(samples)
         print(f"    JudgedPart.{part.name}: Calibration({found.scale:.2f}, {found.spread:.2f}),")

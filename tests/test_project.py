@@ -389,7 +389,7 @@ GENERATED = contents(ROOT)
 @pytest.mark.parametrize("relative", sorted(GENERATED))
 def test_generated_files_are_in_step(relative: str) -> None:
     written = (ROOT / relative).read_text(encoding="utf-8")
-    assert written == GENERATED[relative], f"run `intercap docs`: {relative} is stale"
+    assert written == GENERATED[relative], f"run `intercap dev docs`: {relative} is stale"
 
 
 def test_every_setting_is_described() -> None:

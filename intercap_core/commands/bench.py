@@ -1,4 +1,4 @@
-"""`intercap bench`: seconds per frame and peak memory of one recording, by stage and in total."""
+"""`intercap dev bench`: seconds per frame and peak memory of a recording, by stage and in total."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from intercap_core import artefacts
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import snakemake_command
 from intercap_core.errors import UserError
 from intercap_core.pipeline.step import run_step
@@ -177,7 +175,7 @@ def time_hold_out(settings: Path, sequence: str, frames: int) -> dict[str, float
 
 
 def _print(figures: dict[str, float], title: str) -> None:
-    table = Table("stage", "seconds a frame", "peak memory, MB", title=title, box=None)
+    table = ListTable("stage", "seconds a frame", "peak memory, MB", title=title)
     for area in ("end_to_end", *MEASURED):
         memory = figures.get(f"{area}.peak_memory_mb")
         table.add_row(
@@ -185,7 +183,7 @@ def _print(figures: dict[str, float], title: str) -> None:
             f"{figures[f'{area}.seconds_per_frame']:.3f}",
             "" if memory is None else f"{memory:.0f}",
         )
-    Console().print(table)
+    standard_console().print(table)
     print(
         f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
         f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "

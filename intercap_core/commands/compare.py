@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.compare import SAME, Comparison, compare
 
@@ -31,7 +31,7 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
     if output is not None and output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file, expected a folder for tables; name another output")
     comparison = compare(old, new)
-    console = Console()
+    console = standard_console()
     console.print(_table(comparison))
     if len(comparison.figures):
         console.print(_figures(comparison))
@@ -55,7 +55,7 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
 
 
 def _table(comparison: Comparison) -> Table:
-    table = Table(box=None, pad_edge=False)
+    table = ListTable()
     table.add_column("sequence")
     table.add_column("state")
     for head, _, _ in _COLUMNS:
@@ -74,7 +74,7 @@ def _table(comparison: Comparison) -> Table:
 
 def _figures(comparison: Comparison) -> Table:
     """The datasets' figures side by side."""
-    table = Table("all frames", "old", "new", box=None, pad_edge=False)
+    table = ListTable("all frames", "old", "new")
     for name, old, new in comparison.figures.itertuples(index=False):
         table.add_row(escape(str(name)), f"{old:.4g}", f"{new:.4g}")
     return table

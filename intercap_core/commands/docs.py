@@ -1,4 +1,4 @@
-"""`intercap docs`: documentation that is generated from the code.
+"""`intercap dev docs`: documentation that is generated from the code.
 
 Settings with their defaults, tables of all settings and columns, JSON schemas for editors, the
 contents of every artefact, and the table of the joint fit's terms.
@@ -112,7 +112,7 @@ def settings_page() -> str:
     lines = [
         "# Settings, tables and annotations",
         "",
-        "`intercap docs` generates this page and the schemas in `schemas/` from `config.py`,",
+        "`intercap dev docs` generates this page and the schemas in `schemas/` from `config.py`,",
         "`entries.py` and `annotation.py` in `intercap_core/`. Relative paths are relative to the",
         "file that contains them. Unknown entries are errors; `intercap check` reports them.",
         "",
@@ -219,7 +219,7 @@ def artefacts_page() -> str:
     lines = [
         "# What every artefact holds",
         "",
-        "Generated from `intercap_core/schemas.py` by `intercap docs`. Artefacts are HDF5",
+        "Generated from `intercap_core/schemas.py` by `intercap dev docs`. Artefacts are HDF5",
         "files, one a stage and sequence: `results/<dataset>/<sequence>/<stage>.h5`. All carry",
         "the root attributes `schema`, `schema_version`, `frame`, `units`, `settings_digest` and",
         "`complete`; every dataset has a checksum and units. `intercap inspect FILE` prints one.",

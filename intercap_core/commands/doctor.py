@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.provenance import library_versions, processor
@@ -54,13 +52,13 @@ def findings(project: Project | None) -> Iterator[Finding]:
 
 def print_findings(project: Project | None) -> bool:
     """Print all findings as a table; True if none is a problem."""
-    table = Table(box=None, pad_edge=False, show_header=False)
+    table = ListTable(show_header=False)
     good = True
     for finding in findings(project):
         colour = _COLOURS[finding.state]
         table.add_row(finding.what, f"[{colour}]{finding.state}[/{colour}]", finding.words)
         good &= finding.state != BAD
-    Console().print(table)
+    standard_console().print(table)
     return good
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from intercap_core import artefacts, schemas
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
 
@@ -27,11 +27,11 @@ def print_summary(path: Path, *, verify: bool = False) -> None:
     if name not in known:
         raise UserError(f"{path}: schema {name!r} is not known; known are {', '.join(known)}")
     schema = known[name]
-    console = Console()
+    console = standard_console()
     with artefacts.read(path, schema) as source:
         for key, value in sorted(source.attributes.items()):
             console.print(f"[bold]{escape(key)}[/bold]  {escape(str(value))}", highlight=False)
-        table = Table("dataset", "shape", "type", "units", "frame", "set", "meaning", box=None)
+        table = ListTable("dataset", "shape", "type", "units", "frame", "set", "meaning")
         for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
             shape, dtype, units, frame = source.describe(key)
             try:

@@ -18,10 +18,10 @@ from pathlib import Path
 from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
-from rich.table import Table
 
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
+from intercap_core.commands.console import ListTable
 from intercap_core.disk import free_bytes
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
@@ -305,7 +305,7 @@ class Watcher:
             f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} are finished, "
             f"{waiting} are waiting or up to date"
         )
-        table = Table("sequence", *STAGES, box=None, header_style="bold")
+        table = ListTable("sequence", *STAGES)
         for sequence in shown[:ROWS]:
             making = jobs.get(f"{sequence}: studio")
             first = f"{sequence} (recording)" if making and making.state == "running" else sequence

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.inputs.files import printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
@@ -107,7 +107,7 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
     if as_json:
         print(json.dumps(_to_json(current), indent=1, ensure_ascii=False))
         return
-    console = Console()
+    console = standard_console()
     states = {name: current.of(name) for name in current.sequences}
     counts = {state: list(states.values()).count(state) for state in _MARKS}
     words = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
@@ -134,7 +134,7 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
 
 def _table(current: Status, names: list[str]) -> Table:
     stages = list(dict.fromkeys(stage for name in names for stage in current.sequences[name]))
-    table = Table("sequence", *stages, box=None, header_style="bold", pad_edge=False)
+    table = ListTable("sequence", *stages)
     for name in names:
         own = current.sequences[name]
         table.add_row(

@@ -1,4 +1,4 @@
-"""Figures of `intercap bench` for recordings of known size."""
+"""Figures of `intercap dev bench` for recordings of known size."""
 
 from __future__ import annotations
 

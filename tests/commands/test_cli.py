@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+import typer
 import yaml
 from rich.console import Console
 
@@ -24,6 +25,7 @@ from intercap_core.commands.check import (
     check_detector,
     check_sequences,
 )
+from intercap_core.commands.console import ListTable
 from intercap_core.commands.run import Watcher
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
@@ -35,7 +37,7 @@ from tests.helpers.synthetic_capture import fill, ring, write_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 
-SCENE = ("scene", "config/demo/config.yaml", "cup_drink_s02")
+SCENE = ("stage", "scene", "config/demo/config.yaml", "cup_drink_s02")
 
 
 def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -69,18 +71,49 @@ def test_help_is_quick_and_has_examples() -> None:
     # Processor time, not wall time: whatever else the machine does
     assert end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime < 1.0
     assert done.returncode == 0
-    for command in ("check", "run", "inspect", "object-track", "intercap run config/demo"):
+    for command in ("check", "run", "inspect", "stage", "intercap run config/demo"):
         assert command in done.stdout
 
 
 def test_every_command_has_an_example() -> None:
-    from intercap_core.cli import app
+    tree = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    commands = {**tree, **tree["stage"].commands, **tree["dev"].commands}
+    texts = {name: c.help or "" for name, c in commands.items() if not hasattr(c, "commands")}
+    assert {name.replace("-", "_") for name in texts} > set(STAGES)
+    assert [name for name, text in texts.items() if "Example" not in text] == ["docs"]
 
-    commands = [c for c in app.registered_commands if c.name != "docs"]
-    texts = {c.name or c.callback.__name__: c.callback.__doc__ or "" for c in commands}  # type: ignore[union-attr]
-    texts.pop("docs", None)
-    assert len(texts) >= len(STAGES) + 6
-    assert not [name for name, text in texts.items() if "Example" not in text]
+
+def test_commands_of_groups_are_hidden_aliases() -> None:
+    tree = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+    assert tree["joint"].hidden and tree["evaluate"].hidden and not tree["run"].hidden
+    inner = tree["stage"].commands["joint"]
+    assert not inner.hidden and inner.help == tree["joint"].help
+    assert intercap("--version").stdout.startswith("intercap-core ")
+
+
+def test_view_and_annotate_take_a_sequence_of_the_default_settings(inside: Path) -> None:
+    for command in ("view", "annotate"):
+        done = intercap(command, "good", folder=inside)
+        assert done.stderr.startswith("error: config/config.yaml: there is no such file")
+    done = intercap("view", "config.yaml", folder=inside)
+    assert "name one of its sequences: good, bad, empty" in done.stderr
+
+
+@pytest.mark.parametrize("width", [40, 80, 400])
+def test_tables_never_truncate_a_cell(width: int) -> None:
+    table = ListTable("sequence", *(f"heading_{n}" for n in range(9)), "meaning")
+    cells = [
+        "subject_01_suitcase_carry",
+        *(f"[green]cell{n}[/green]" for n in range(9)),
+        "a b" * 30,
+    ]
+    table.add_row(*cells)
+    stream = io.StringIO()
+    Console(file=stream, width=width).print(table)
+    words = stream.getvalue()
+    for cell in ("subject_01_suitcase_carry", *(f"cell{n}" for n in range(9)), "heading_8"):
+        assert cell in words
+    assert max(len(line.rstrip()) for line in words.splitlines()) <= width
 
 
 def test_help_imports_no_numerical_library() -> None:
@@ -104,13 +137,16 @@ def test_stages_read_only_earlier_stages() -> None:
     ("arguments", "says"),
     [
         (("check", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
-        (("joint", "config/demo/config.yaml", "nobody"), "sequence 'nobody' is not in the table"),
-        (("studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
+        (
+            ("stage", "joint", "config/demo/config.yaml", "nobody"),
+            "sequence 'nobody' is not in the table",
+        ),
+        (("dev", "studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
         ((*SCENE, "--output", "README.md"), "README.md: exists and is not an artefact"),
         ((*SCENE, "--output", "docs"), "docs: is a folder, expected a file"),
         ((*SCENE, "--output", "README.md/a.h5"), "README.md/a.h5: cannot be written ("),
         ((*SCENE, "--output", "/proc/a.h5"), "/proc/a.h5: cannot be written ("),
-        (("evaluate", "--output", "/proc/a.json"), "/proc/a.json: cannot be written ("),
+        (("dev", "evaluate", "--output", "/proc/a.json"), "/proc/a.json: cannot be written ("),
         (("inspect", "README.md"), "README.md: not an artefact"),
         (("inspect", "nowhere.h5"), "nowhere.h5: there is no such file"),
     ],
@@ -403,7 +439,7 @@ def test_a_stage_rejects_inputs_of_another_sequence(small_project: Path) -> None
     place = small_project / "results" / "trial" / "good"
     place.mkdir(parents=True)
     write_frames(place / "frames.h5", ring(1)[0], num_sets=1)
-    done = intercap("person", "config.yaml", "good", folder=small_project)
+    done = intercap("stage", "person", "config.yaml", "good", folder=small_project)
     assert done.returncode == 1
     assert done.stderr == (
         "error: results/trial/good/frames.h5: holds sequence 'test', expected 'good'; "
@@ -440,7 +476,7 @@ def test_the_studio_never_replaces_real_recordings(small_project: Path) -> None:
         "\tresults/trial/recordings/good/calibration.json\n"
     )
     assert load_project(small_project / "config.yaml").recordings_made("good") is None
-    done = intercap("studio", "config.yaml", "good", folder=small_project)
+    done = intercap("dev", "studio", "config.yaml", "good", folder=small_project)
     assert done.returncode == 1 and "its recordings are real" in done.stderr
 
 

@@ -1,4 +1,4 @@
-"""`intercap evaluate`: virtual recordings compared with their truth.
+"""`intercap dev evaluate`: virtual recordings compared with their truth.
 
 - ``run``: the command; runs the workflows, measures, prints and writes the figures.
 - ``part``: the type of a part of the evaluation, and caching of measured errors.

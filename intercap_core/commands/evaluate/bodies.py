@@ -1,4 +1,4 @@
-"""Part ``bodies`` of `intercap evaluate`: body fits compared with truth.
+"""Part ``bodies`` of `intercap dev evaluate`: body fits compared with truth.
 
 The reference is the dataset named ``object`` (or ``body``). Datasets such as ``object_noise2`` and
 ``body_two_view`` are its variants.
@@ -12,13 +12,13 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
     add_rows,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -131,7 +131,7 @@ def flat(evaluations: Sequence[Bodies]) -> Figures:
 
 def print_bodies(evaluations: Sequence[Bodies]) -> None:
     """Print tables by interaction, by rig, by joint, and of each recording's worst frame."""
-    console = console_of(190)
+    console = standard_console()
     projects = _sort(evaluations)
     for found in projects.separate:
         _print_interactions(console, found)
@@ -150,7 +150,7 @@ def print_bodies(evaluations: Sequence[Bodies]) -> None:
 
 
 def _print_interactions(console: Console, found: Bodies) -> None:
-    table = Table("interaction", "frames", *_COLUMNS, box=None)
+    table = ListTable("interaction", "frames", *_COLUMNS)
     table.title = f"{found.dataset}: bodies against truth, mm, after body_fit"
     for name, errors in body_errors.by_interaction(found.errors).items():
         figures = body_errors.figures(errors)
@@ -163,7 +163,7 @@ def _print_interactions(console: Console, found: Bodies) -> None:
 
 def _print_rigs(console: Console, projects: _Projects) -> None:
     assert projects.reference is not None
-    table = Table("rig", "frames", *_COLUMNS, box=None)
+    table = ListTable("rig", "frames", *_COLUMNS)
     table.title = f"the same {len(projects.compared)} recordings with less"
     _add_row(table, projects.reference.rig, projects.compared)
     for found in projects.reduced:
@@ -180,7 +180,7 @@ def _add_row(table: Table, name: str, errors: Sequence[BodyErrors]) -> None:
 
 def _print_joints(console: Console, evaluations: Sequence[Bodies]) -> None:
     """Print mean, 95th percentile and normalised error of each joint, for each project."""
-    table = Table("joint", box=None, title="body joints: mean and p95, mm; median normalised error")
+    table = ListTable("joint", title="body joints: mean and p95, mm; median normalised error")
     columns = [body_errors.by_joint(found.errors) for found in evaluations]
     for found in evaluations:
         for head in (found.dataset, "p95", "norm."):
@@ -196,9 +196,9 @@ def _print_joints(console: Console, evaluations: Sequence[Bodies]) -> None:
 
 
 def _print_worst(console: Console, evaluations: Sequence[Bodies]) -> None:
-    table = Table(
+    table = ListTable(
         "recording", "rig", "frame", "PVE", "MPJPE", "worst joint", "mm", "hands", "flagged",
-        box=None, title="each recording's worst frame",
+        title="each recording's worst frame",
     )  # fmt: skip
     for found in evaluations:
         for e in found.errors:

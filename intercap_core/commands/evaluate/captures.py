@@ -1,4 +1,4 @@
-"""Part ``captures`` of `intercap evaluate`: scene artefacts compared with truth."""
+"""Part ``captures`` of `intercap dev evaluate`: scene artefacts compared with truth."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     SPREAD,
     EvaluationPart,
     Figures,
     Measured,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -44,10 +43,10 @@ def flat(evaluations: Sequence[Captures]) -> Figures:
 
 def print_captures(evaluations: Sequence[Captures]) -> None:
     """Print a table with a row per capture, and a table of figures with a column per project."""
-    console = console_of(112)
+    console = standard_console()
     heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
              "deg")  # fmt: skip
-    table = Table("capture", *heads, box=None, title="captures against truth, after scene")
+    table = ListTable("capture", *heads, title="captures against truth, after scene")
     for found in evaluations:
         for e in found.errors:
             table.add_row(
@@ -67,7 +66,7 @@ def print_captures(evaluations: Sequence[Captures]) -> None:
     console.print(table)
     columns = [with_spread(scene_errors.figures, found.errors) for found in evaluations]
     names = [name for column in columns for name in column if not name.endswith(SPREAD)]
-    table = Table("measure", *(found.dataset for found in evaluations), box=None)
+    table = ListTable("measure", *(found.dataset for found in evaluations))
     table.title = "all captures, after scene (+- standard error over captures)"
     for name in dict.fromkeys(names):
         table.add_row(name, *(_cell(column, name) for column in columns))

@@ -1,4 +1,4 @@
-"""Number of constants of the package, ``constants.total`` of `intercap evaluate`.
+"""Number of constants of the package, ``constants.total`` of `intercap dev evaluate`.
 
 A constant is a name in capitals that a module binds to a number or to a tuple of numbers. It has a
 source if the comment on its line or above it cites one: a paper, a data sheet, a standard, anatomy,

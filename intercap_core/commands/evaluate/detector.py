@@ -1,4 +1,4 @@
-"""Part ``detector`` of `intercap evaluate`: all stages with keypoints of a real detector.
+"""Part ``detector`` of `intercap dev evaluate`: all stages with keypoints of a real detector.
 
 MediaPipe detects the keypoints in the studio's images (:mod:`intercap_core.studio.mediapipe`). The
 detector's errors last over frames and are shared by views, and it often misses hands that hold an
@@ -14,17 +14,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.table import Table
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -227,13 +226,13 @@ def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
     columns = [*FIGURES, "grip_slip_mm"]
     heads = [name.replace("_mm", " mm").replace("_", " ") for name in columns]
     for found in evaluations:
-        table = Table("recording", *heads, box=None, title=f"{found.dataset}, after joint")
+        table = ListTable("recording", *heads, title=f"{found.dataset}, after joint")
         for name, some in [*((r.metrics.name, [r]) for r in found.errors), ("all", found.errors)]:
             row = figures(some)
             digits = (2 if "f1" in column else 1 for column in columns)
             table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
-        console_of(160).print(table)
-        table = Table("recording", *TRUE, *(f.name for f in fields(RigErrors)), box=None)
+        standard_console().print(table)
+        table = ListTable("recording", *TRUE, *(f.name for f in fields(RigErrors)))
         table.title = (
             f"{found.dataset}: true error, stated error and its 80 % range, mm; cameras: RMS of "
             "error and standard deviation"
@@ -248,7 +247,7 @@ def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
         row = figures(found.errors)
         shares = (number(row.get(f"verdict_coverage_{part}"), 2) for part in TRUE)
         table.add_row("share in the range", *shares)
-        console_of(160).print(table)
+        standard_console().print(table)
         for name in found.missing:
             print(f"{found.dataset}: {name}: no metrics")
 

@@ -1,4 +1,4 @@
-"""Part ``field`` of `intercap evaluate`: metrics and verdict under field conditions.
+"""Part ``field`` of `intercap dev evaluate`: metrics and verdict under field conditions.
 
 The verdict estimates errors without truth by fits without each camera.
 
@@ -15,18 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.table import Table
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.commands.bench import time_hold_out
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -127,7 +126,7 @@ def last_stage(project: Project) -> str | None:
 
 
 def seconds(project: Project, sequence: str) -> Figures:
-    """``verdict.seconds_per_frame`` of one recording, measured as by `intercap bench`."""
+    """``verdict.seconds_per_frame`` of one recording, measured as by `intercap dev bench`."""
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
         frames = len(recorded["times"])
     return time_hold_out(project.path, sequence, frames)
@@ -217,10 +216,10 @@ def _of_a_person_alone(sequence: FieldSequence) -> bool:
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
     """Print one row per recording: true and stated errors, bone lengths, height."""
-    console = console_of(138)
+    console = standard_console()
     heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
              "bones %", "height mm", "subject %", "up deg", "stated")  # fmt: skip
-    table = Table("recording", *heads, box=None, title="the field, after metrics")
+    table = ListTable("recording", *heads, title="the field, after metrics")
     for found in evaluations:
         for e in found.errors:
             cells = []

@@ -1,4 +1,4 @@
-"""Part ``field_scenes`` of `intercap evaluate`: scene artefacts under field conditions.
+"""Part ``field_scenes`` of `intercap dev evaluate`: scene artefacts under field conditions.
 
 Cameras that start at different times or have different rates, rooms whose measured surface is
 mostly floor, a person on a balance beam.
@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -71,10 +70,10 @@ def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
 
 def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
     """Print one row per recording."""
-    console = console_of(128)
+    console = standard_console()
     heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
              "floor mm", "deg")  # fmt: skip
-    table = Table("recording", *heads, box=None, title="the field, after scene")
+    table = ListTable("recording", *heads, title="the field, after scene")
     for found in evaluations:
         for e in found.errors:
             table.add_row(

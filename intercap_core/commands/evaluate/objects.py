@@ -1,4 +1,4 @@
-"""Part ``objects`` of `intercap evaluate`: object tracks compared with truth."""
+"""Part ``objects`` of `intercap dev evaluate`: object tracks compared with truth."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
     add_rows,
     config_files,
-    console_of,
     keyed,
     number,
     truth_of,
@@ -94,9 +93,9 @@ def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
 
 def print_objects(evaluations: Sequence[Objects]) -> None:
     """Print for each project a table by object and a table by number of views."""
-    console = console_of(120)
+    console = standard_console()
     for found in evaluations:
-        table = Table("object", *_COLUMNS, box=None)
+        table = ListTable("object", *_COLUMNS)
         table.title = f"{found.dataset}: objects against truth, after object_track"
         for name, errors in by_object(found.errors).items():
             add_rows(table, name, object_errors.figures(errors), _COLUMNS)
@@ -104,7 +103,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
         for name in found.missing:
             table.add_row(f"{name}: no track")
         console.print(table)
-        table = Table("views that see it", "frames", "mm", "deg", "lost", box=None)
+        table = ListTable("views that see it", "frames", "mm", "deg", "lost")
         for name, figures in object_errors.by_views(found.errors).items():
             digits = (0, 1, 2, 3)
             table.add_row(
@@ -113,7 +112,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
         console.print(table)
     drawn = lost_by_draw(evaluations)
     if drawn:
-        table = Table("object", "lost, redrawn detections", "spread", box=None)
+        table = ListTable("object", "lost, redrawn detections", "spread")
         for name, shares in drawn.items():
             each = "  ".join(number(share, 3) for share in shares)
             table.add_row(name, each, number(max(shares) - min(shares), 3))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from intercap_core.errors import UserError
@@ -209,13 +208,6 @@ def add_rows(
     if any(key + SPREAD in figures for key, _ in columns.values()):
         row = (number(figures.get(key + SPREAD), digits) for key, digits in columns.values())
         table.add_row("  +-", *("" for _ in cells), *row)
-
-
-def console_of(width: int) -> Console:
-    """A console of at least this width, so that piped tables are not truncated."""
-    console = Console()
-    console.width = max(console.width, width)
-    return console
 
 
 def number(value: float | None, digits: int) -> str:

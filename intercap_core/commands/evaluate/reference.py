@@ -15,9 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 
 REFERENCE = Path("bench/reference-quick.json")
@@ -92,9 +90,8 @@ def read_reference(path: Path = REFERENCE) -> list[GatedFigure]:
 
 def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) -> bool:
     """Print every gated figure with its verdict; return whether none is worse or missing."""
-    console = Console()
-    table = Table("figure", "reference", "now", "spread", "verdict", box=None)
-    table.columns[0].no_wrap = True
+    console = standard_console()
+    table = ListTable("figure", "reference", "now", "spread", "result")
     table.title = "regression gate"
     failing = []
     for figure in reference:
@@ -109,7 +106,6 @@ def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) 
             f"{figure.spread:.3f}",
             result.value,
         )
-    console.width = max(console.width, 110)
     console.print(table)
     if failing:
         print(

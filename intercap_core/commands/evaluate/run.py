@@ -1,4 +1,4 @@
-"""The command `intercap evaluate`: compare virtual recordings with truth."""
+"""The command `intercap dev evaluate`: compare virtual recordings with truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Part ``sequences`` of `intercap evaluate`: all stages compared with truth."""
+"""Part ``sequences`` of `intercap dev evaluate`: all stages compared with truth."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import (
     SPREAD,
     EvaluationPart,
@@ -178,28 +177,28 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
 
 def print_sequences(evaluations: Sequence[Sequences]) -> None:
     """Print a table of the three stages, one of the other areas, and one by object."""
-    console = Console()
+    console = standard_console()
     found = {name: with_spread(flat_areas, some) for name, some in groups(evaluations).items()}
     keys = dict.fromkeys(key for figures in found.values() for key in figures)
     keys = dict.fromkeys(key for key in keys if not key.endswith(SPREAD))
     measures = [key.partition(".")[2] for key in keys if key.partition(".")[0] in ESTIMATES]
     for group, some in groups(evaluations).items():
-        table = Table("measure", *ESTIMATES, box=None)
+        table = ListTable("measure", *ESTIMATES)
         table.title = f"against truth, {group} ({len(some)} sequences, +- standard error)"
         for measure in dict.fromkeys(measures):
             table.add_row(measure, *(_cell(found[group], f"{s}.{measure}") for s in ESTIMATES))
         console.print(table)
-    table = Table("after joint", *found, box=None, title="all frames (+- standard error)")
+    table = ListTable("after joint", *found, title="all frames (+- standard error)")
     for key in keys:
         if key.partition(".")[0] not in ESTIMATES:
             table.add_row(key, *(_cell(figures, key) for figures in found.values()))
     console.print(table)
     for group, some in groups(evaluations).items():
-        table = Table("object", *BY_OBJECT, "stated F1", "penetration mm", box=None)
+        table = ListTable("object", *BY_OBJECT, "stated F1", "penetration mm")
         table.title = f"sequential fits > joint, {group}"
         for name, of_object in _by_object(some).items():
             table.add_row(name, *_row(areas(of_object)))
-        Console(width=max(console.width, 190)).print(table)
+        console.print(table)
     for name in (name for measured in evaluations for name in measured.missing):
         print(f"{name}: no metrics")
 

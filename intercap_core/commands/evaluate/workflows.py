@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.table import Table
 
 from intercap_core.commands.check import check_bodies
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.evaluate.part import Figures, Targets
 from intercap_core.commands.run import POLL_SECONDS, Watcher, snakemake_command
 from intercap_core.errors import UserError
@@ -226,10 +226,10 @@ def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
 
 def print_minutes(parts: Sequence[str], minutes: Figures, duration: float) -> None:
     """Print one row per part, and the ``duration`` of this run in minutes."""
-    table = Table("part", "budget", "taken", box=None, title="minutes on 2 cores")
+    table = ListTable("part", "budget", "taken", title="minutes on 2 cores")
     for part in parts:
         budget, taken = (minutes[f"{part}_minutes_{key}"] for key in ("budget", "taken"))
         excess = "over its budget" if taken > budget else ""
         table.add_row(part, f"{budget:.1f}", f"{taken:.1f}", excess)
-    Console().print(table)
+    standard_console().print(table)
     print(f"this run took {duration:.1f} minutes of wall time")

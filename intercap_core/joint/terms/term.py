@@ -40,7 +40,7 @@ class Data(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Equation:
-    """A term's row in the table of docs/equations.md, which `intercap docs` generates."""
+    """A term's row in the table of docs/equations.md, which `intercap dev docs` generates."""
 
     symbol: str
     """The paper's symbol, or a name if the paper has none."""

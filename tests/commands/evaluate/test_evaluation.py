@@ -1,4 +1,4 @@
-"""Settings, figures and tables of `intercap evaluate`."""
+"""Settings, figures and tables of `intercap dev evaluate`."""
 
 from __future__ import annotations
 

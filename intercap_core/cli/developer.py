@@ -1,0 +1,158 @@
+"""`intercap dev`: commands for the development of this program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from intercap_core.cli.options import (
+    Cores,
+    SequenceName,
+    Settings,
+    check_output,
+    open_project,
+)
+from intercap_core.errors import UserError
+
+app = typer.Typer()
+
+
+Part = Literal[
+    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector"
+]  # fmt: skip
+
+
+def _evaluated(stage: str, which: str = "Projects") -> Any:
+    """Option for the projects of a part of the evaluation."""
+    words = f"{which} evaluated up to {stage}; may repeat."
+    return typer.Option(metavar="SETTINGS", help=words)
+
+
+@app.command()
+def evaluate(
+    settings: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="SETTINGS",
+            help="Projects evaluated up to the metrics. Default here and of the options below: the "
+            "recordings in config/.",
+        ),
+    ] = None,
+    captures: Annotated[list[Path] | None, _evaluated("the scene")] = None,
+    objects: Annotated[list[Path] | None, _evaluated("the object track")] = None,
+    bodies: Annotated[list[Path] | None, _evaluated("the body fit")] = None,
+    field_scenes: Annotated[
+        list[Path] | None, _evaluated("the scene", "Projects with field conditions,")
+    ] = None,
+    field: Annotated[
+        list[Path] | None,
+        _evaluated("the metrics", "Projects with and without field conditions,"),
+    ] = None,
+    detector: Annotated[
+        list[Path] | None,
+        _evaluated("the metrics", "Projects with keypoints of a real detector (make mediapipe),"),
+    ] = None,
+    only: Annotated[
+        Part | None,
+        typer.Option(
+            help="Evaluate one part only: sequences, field and detector up to the metrics, "
+            "captures and field_scenes up to the scene, objects up to the object track, bodies up "
+            "to the body fit."
+        ),
+    ] = None,
+    output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
+        "results/evaluation.json"
+    ),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Evaluate six recordings in about five minutes; exit with an error if a figure is "
+            "worse than in bench/reference-quick.json by more than its spread.",
+        ),
+    ] = False,
+    update_reference: Annotated[
+        bool,
+        typer.Option(
+            "--update-reference",
+            help="With --quick: record the figures in bench/reference-quick.json.",
+        ),
+    ] = False,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Draw other people, motions, rooms and errors; results go to results/seed_<N>.",
+        ),
+    ] = None,
+    cores: Cores = 0,
+) -> None:
+    """Run the virtual evaluation recordings and print their errors against the truth.
+
+    Examples: intercap dev evaluate; intercap dev evaluate --only bodies --output body.json;
+    intercap dev evaluate --only objects --seed 7 --output results/seed_7/evaluation.json
+    """
+    from intercap_core.commands.evaluate.run import evaluate as run_evaluation
+    from intercap_core.commands.evaluate.run import evaluate_quick
+
+    check_output(output, replace_any=True)
+    if quick and seed is not None:
+        raise UserError("--quick is a fixed set; leave out --quick or --seed")
+    if update_reference and not quick:
+        raise UserError("--update-reference records the quick set; add --quick")
+    if quick:
+        status = evaluate_quick(output, cores=cores, renew_reference=update_reference)
+        raise typer.Exit(status)
+    parts = {
+        "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
+        "field_scenes": field_scenes, "field": field, "detector": detector,
+    }  # fmt: skip
+    chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
+    raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))
+
+
+@app.command()
+def bench(
+    settings: Settings = Path("config/bench/config.yaml"),
+    output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
+        "results/bench.json"
+    ),
+    cores: Cores = 0,
+) -> None:
+    """Measure seconds per frame and peak memory on one recording, by stage and end to end.
+
+    Example: intercap dev bench
+    """
+    from intercap_core.commands.bench import measure
+
+    check_output(output, replace_any=True)
+    measure(settings, output, cores=cores)
+
+
+@app.command()
+def studio(settings: Settings, sequence: SequenceName) -> None:
+    """Make one virtual recording whose truth is known.
+
+    Example: intercap dev studio config/demo/config.yaml cup_drink_s02
+    """
+    project = open_project(settings, sequence)
+    from intercap_core.pipeline.step import run_studio
+
+    typer.echo(run_studio(project, sequence))
+
+
+@app.command()
+def docs(
+    root: Annotated[Path, typer.Argument(help="The project's root.")] = Path("."),
+    check_only: Annotated[bool, typer.Option("--check", help="Only list stale files.")] = False,
+) -> None:
+    """Write the files that are generated from code: settings, schemas, pages on artefacts."""
+    from intercap_core.commands.docs import generate
+
+    stale = generate(root, write=not check_only)
+    for path in stale:
+        typer.echo(f"{'stale' if check_only else 'written'}: {path}")
+    if check_only and stale:
+        raise typer.Exit(1)

@@ -1,0 +1,258 @@
+"""Commands of a whole dataset."""
+
+from __future__ import annotations
+
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from intercap_core.cli.options import (
+    DEFAULT_SETTINGS,
+    Cores,
+    Settings,
+    open_project,
+    prepare,
+)
+
+app = typer.Typer()
+
+
+class ReleasedKind(StrEnum):
+    """Kinds of files that `intercap release` lists."""
+
+    card = "card"
+    tables = "tables"
+    site = "site"
+    export = "export"
+    artefact = "artefact"
+
+
+@app.command()
+def check(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Check settings, tables, annotations and recordings, and list every problem.
+
+    Opens each recording and compares its image size with the calibration, its length with its
+    header and the other cameras, and its images with the detections. Takes a fraction of a second
+    per sequence.
+
+    Example: intercap check config/demo/config.yaml
+    """
+    from intercap_core.commands.check import check_bodies, check_detector, check_sequences
+    from intercap_core.project import load_project
+
+    project = load_project(settings)
+    check_bodies(project)
+    notes = check_detector(project)
+    start = time.monotonic()
+    found = check_sequences(project)
+    elapsed, faults = time.monotonic() - start, found.faults
+    for summary in found.summaries:
+        typer.echo(summary)
+    for note in [*notes, *found.notes]:
+        typer.echo(f"note: {note}")
+    for fault in faults:
+        typer.echo(f"problem: {fault}", err=True)
+    if found.summaries:
+        count = len(found.summaries)
+        typer.echo(f"checked the recordings of {count} sequences in {elapsed:.1f} s")
+    good = len(project.sequences) - len({fault.sequence for fault in faults} - {""})
+    typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
+    if faults:
+        raise typer.Exit(1)
+
+
+@app.command()
+def tables(
+    layout: Annotated[
+        Literal["intercap", "behave"],
+        typer.Argument(metavar="LAYOUT", help="Released dataset: intercap or behave."),
+    ],
+    root: Annotated[Path, typer.Argument(help="Folder of the unpacked release.")],
+    output: Annotated[
+        Path, typer.Option(help="Folder for config.yaml and its tables, such as config/intercap.")
+    ],
+    dataset: Annotated[
+        str | None, typer.Option(help="Name of the dataset; default: the layout's name.")
+    ] = None,
+    calibrations: Annotated[
+        Path | None, typer.Option(help="intercap: folder of calibration_first, _second, _third.")
+    ] = None,
+    annotations: Annotated[
+        Path | None, typer.Option(help="intercap: folder of subject01_motion01_seg0, ...")
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="intercap: folder of the release's 01.ply, 02.ply, ...")
+    ] = None,
+    objects: Annotated[
+        Path, typer.Option(help="intercap without meshes: the objects.yaml to use.")
+    ] = Path("config/objects.yaml"),
+    keypoints: Annotated[
+        Path | None, typer.Option(help="intercap: keypoint files, a folder for each sequence.")
+    ] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(help="intercap: segmentations, a folder for each sequence.")
+    ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            help="Released results that replace the joint fit in metrics and pages, a folder for "
+            "each sequence. InterCap: its Res/ folder. BEHAVE: the dataset's folder, or the folder "
+            "of its 30 fps parameters with meshes."
+        ),
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite existing files.")] = False,
+) -> None:
+    """Write a project's settings, tables and annotations for a released dataset.
+
+    The release itself is not changed. Missing and contradictory entries are printed, and written
+    as remarks into the tables: read them before you run.
+
+    Examples: intercap tables intercap ~/InterCap --output config/intercap;
+    intercap tables intercap ~/InterCap --results ~/InterCap/Res --dataset theirs --output
+    config/theirs; intercap tables behave ~/BEHAVE --output config/behave; intercap tables behave
+    ~/BEHAVE --results ~/BEHAVE --dataset theirs --output config/theirs
+    """
+    from intercap_core.commands.tables import write_tables
+    from intercap_core.tables.intercap import Sources
+
+    sources = Sources(calibrations, annotations, meshes, keypoints, candidates, results)
+    draft, written = write_tables(
+        layout, root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
+    )
+    for remark in draft.all_remarks():
+        typer.echo(f"note: {remark}", err=True)
+    for path in written:
+        typer.echo(path)
+    typer.echo(f"{len(draft.rows)} sequences; next: intercap check {output / 'config.yaml'}")
+
+
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+)
+def run(
+    context: typer.Context,
+    settings: Settings = DEFAULT_SETTINGS,
+    cores: Cores = 0,
+    profile: Annotated[
+        Path | None,
+        typer.Option(help="Snakemake workflow profile: profiles/slurm for a Slurm cluster."),
+    ] = None,
+) -> None:
+    """Compute everything that is missing or out of date, and show the progress.
+
+    Wraps Snakemake, which gets all further arguments. If a sequence fails, the others go on, and
+    the report covers those that succeed.
+
+    Examples: intercap run config/demo/config.yaml;
+    intercap run config/demo/config.yaml --cores 2 -- --until joint;
+    intercap run config/lab/config.yaml --profile profiles/slurm
+    """
+    from intercap_core.commands.run import run_workflow
+
+    status = run_workflow(settings, cores=cores, profile=profile, arguments=context.args)
+    raise typer.Exit(status)
+
+
+@app.command()
+def status(
+    settings: Settings = DEFAULT_SETTINGS,
+    every: Annotated[bool, typer.Option("--all", help="Include sequences that are done.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Print which sequences are done, out of date, failed, running or waiting, with the reasons.
+
+    Compares the manifest of each result (settings, annotation, files, code, libraries) with the
+    present one and names the differences. `intercap run` computes exactly these results again.
+    Nothing is computed.
+
+    Example: intercap status config/demo/config.yaml
+    """
+    from intercap_core.commands.status import print_status
+    from intercap_core.project import load_project
+
+    print_status(load_project(settings), every=every, as_json=as_json)
+
+
+@app.command()
+def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Read every result completely and list the damaged ones; exits with status 1 if there are any.
+
+    To make a damaged result again, delete it and run.
+
+    Example: intercap verify config/demo/config.yaml
+    """
+    project = open_project(settings)
+    from intercap_core.commands.status import print_verification
+
+    raise typer.Exit(0 if print_verification(project) else 1)
+
+
+@app.command()
+def report(settings: Settings = DEFAULT_SETTINGS) -> None:
+    """Write the site from the existing results: a page per sequence, tables, heatmaps, overview.
+
+    Example: intercap report config/demo/config.yaml
+    """
+    project = open_project(settings)
+    from intercap_core.commands.report import write_site
+
+    typer.echo(write_site(project))
+
+
+@app.command()
+def compare(
+    old: Annotated[Path, typer.Argument(help="Results folder of the earlier version.")],
+    new: Annotated[Path, typer.Argument(help="Results folder of the later version.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for the tables by sequence and by frame, CSV.")
+    ] = None,
+) -> None:
+    """Print the differences between two versions of a dataset, by sequence and frame.
+
+    Lists how far body, hands and object moved after the joint fit, which frames gained or lost
+    contact or a flag, the stated errors, and the figures of both versions. Copy the results before
+    you fix an annotation, and compare afterwards. You can also compare another program's results
+    for the same recordings (column results of sequences.tsv) with ours.
+
+    Example: intercap compare results/demo_before results/demo --output changes
+    """
+    from intercap_core.commands.compare import print_comparison
+
+    for path in print_comparison(old, new, output):
+        typer.echo(path)
+
+
+@app.command()
+def release(
+    settings: Settings = DEFAULT_SETTINGS,
+    only: Annotated[
+        list[ReleasedKind] | None,
+        typer.Option(help="Kinds of files to list; may repeat. Default: all."),
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Verify this folder against the list in it; needs no settings."
+        ),
+    ] = None,
+) -> None:
+    """List the dataset's files with checksums, versions and settings, for publication.
+
+    Writes release.json and release.sha256 next to the card (card.md, card.json, croissant.json);
+    the card's texts come from the settings' section `card`. Recipients verify the files with
+    --check or with sha256sum -c release.sha256.
+
+    Examples: intercap release config/demo/config.yaml --only card --only tables --only export;
+    intercap release --check results/demo
+    """
+    prepare()
+    from intercap_core.commands.release import check_release, write_release
+    from intercap_core.output.release.manifest import KINDS
+    from intercap_core.project import load_project
+
+    if check is not None:
+        raise typer.Exit(0 if check_release(check) else 1)
+    typer.echo(write_release(load_project(settings), [*only] if only else KINDS))
