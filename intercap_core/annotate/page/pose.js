@@ -2,6 +2,7 @@
  * fit to the images. No other module knows how the annotation stores poses. */
 import { post } from "./api.js";
 import { button, make } from "./dom.js";
+import { same } from "./draft.js";
 import { IDENTITY, apply, invert, rigid, rotationVector, rows, rotate, rotateAbout } from "./geometry.js";
 
 const ROTATION_PER_PX = 0.008; // radians per pixel of a drag
@@ -60,6 +61,7 @@ export class PoseEditor {
     this.editing = false;
     this.pose = null;
     this.report = "";
+    this.fits = app.pose?.fits ?? new Map(); // promises of the fits in progress by frame
   }
 
   /* Pose of the result in a frame; null if there is none. */
@@ -184,27 +186,53 @@ export class PoseEditor {
     }, { capture: true });
   }
 
-  /* Fit the pose to the images on the server. */
-  async snap() {
+  /* Fit the pose to the images on the server. A pose that is edited or removed during the fit is kept. */
+  snap() {
     if (!this.editing) this.start();
-    const { app } = this, frame = app.frame;
+    const { frame } = this.app;
+    if (this.fits.has(frame)) return;
     this.report = "fitting…";
+    const fit = this.#fit(frame).finally(() => {
+      if (this.fits.get(frame) === fit) this.fits.delete(frame);
+      this.changed();
+    });
+    this.fits.set(frame, fit);
     this.panel();
+  }
+
+  async #fit(frame) {
+    const { app, pose } = this, stored = poseAt(app.draft, frame);
+    const edited = () => this.editing && app.frame === frame ? !same(this.pose, pose) : !same(poseAt(app.draft, frame), stored);
+    const report = (text) => {
+      if (this.editing && app.frame === frame) this.report = text;
+      else app.say(`frame ${frame}: ${text}`);
+    };
     try {
       const fit = await post(`sequences/${app.info.sequence}/snap`, {
-        frame, rotation_vector: rotationVector(this.pose), translation: this.pose.map((row) => row[3]),
+        frame, rotation_vector: rotationVector(pose), translation: pose.map((row) => row[3]),
       });
-      if (app.frame !== frame || !this.editing) return;
-      if (fit.seen) {
-        this.pose = rigid(fit.rotation_vector, fit.translation);
-        this.report = `fitted: overlap ${fit.overlap.toFixed(2)} in ${fit.views} views, moved by ${(1000 * fit.moved_m).toFixed(0)} mm and rotated by ${((fit.turned_rad * 180) / Math.PI).toFixed(0)}°`;
-        this.put("object fitted to the images");
-      } else this.report = "the images support no pose near this one: drag the object closer to its true pose, or keep yours";
-    } catch (error) { this.report = error.message; }
-    this.changed();
+      if (!this.fits.has(frame)) return; // the pose was removed
+      if (edited()) report("the fit is discarded, because the pose was edited meanwhile");
+      else if (fit.seen) {
+        const fitted = rigid(fit.rotation_vector, fit.translation);
+        if (this.editing && app.frame === frame) this.pose = fitted;
+        report(`fitted: overlap ${fit.overlap.toFixed(2)} in ${fit.views} views, moved by ${(1000 * fit.moved_m).toFixed(0)} mm and rotated by ${((fit.turned_rad * 180) / Math.PI).toFixed(0)}°`);
+        putPose(app.draft, frame, fitted, "object fitted to the images");
+      } else report("the images support no pose near this one: drag the object closer to its true pose, or keep yours");
+    } catch (error) { report(error.message); }
+  }
+
+  /* Wait until all edits are in the draft: fits in progress, and the wheel's last step. */
+  async settle() {
+    while (this.fits.size) {
+      this.app.say(`waiting for the fit of frame ${[...this.fits.keys()].join(", ")}`);
+      await Promise.all(this.fits.values());
+    }
+    this.finishWheel();
   }
 
   remove() {
+    this.fits.delete(this.app.frame);
     removePose(this.app.draft, this.app.frame);
     this.app.setMode(null);
   }
@@ -233,6 +261,10 @@ export class PoseEditor {
     ];
     if (box.contains(document.activeElement) && document.activeElement.tagName === "INPUT") { // while the user types
       box.querySelector(".report").textContent = this.report;
+      box.querySelectorAll(".numbers input").forEach((input, k) => { // a typed number equals its value
+        const value = numbers[k][1]();
+        if (Math.abs(input.valueAsNumber - value) > 1e-4) input.value = value.toFixed(4);
+      });
       return box;
     }
     box.replaceChildren(

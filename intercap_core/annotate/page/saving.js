@@ -83,8 +83,10 @@ export class Saving {
   async save() {
     if (this.busy) return;
     this.busy = true;
-    this.app.pose?.finishWheel();
-    try { await this.#save(); } finally { this.busy = false; }
+    try {
+      await this.app.pose?.settle();
+      await this.#save();
+    } finally { this.busy = false; }
   }
 
   async #save() {

@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from tests.annotate.browser.hand import Hand, open_page
+from tests.annotate.browser.hand import SAVED, Hand, open_page
 from tests.annotate.served import annotation, served
 from tests.helpers.browser import needs_chromium
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
 
 pytestmark = needs_chromium
 
@@ -100,6 +105,57 @@ def test_typed_numbers_are_committed_before_shortcuts(settings: Path) -> None:
         hand.page.wait_for_timeout(300)
         assert [pose["frame"] for pose in hand.draft("object_poses")] == [0]
         assert hand.app("draft.undoSteps.at(-1).label") == "object distance changed"
+
+
+def test_a_late_fit_keeps_edits_and_saving_waits_for_it(settings: Path) -> None:
+    def poses(hand: Hand) -> list[list[float]]:
+        return [pose["translation"] for pose in hand.draft("object_poses") or ()]
+
+    with served(settings) as server, open_page(server) as hand:
+        held: list[Route] = []
+        hand.page.route("**/snap", lambda route: held.append(route))
+
+        def fit() -> None:
+            hand.press("s")
+            while not held:
+                hand.page.wait_for_timeout(20)
+
+        def arrive() -> None:
+            held.pop().continue_()
+            hand.wait("!window.annotate.pose.fits.size")
+
+        hand.press("o")
+        hand.drag(hand.object_middle(), (9, 4))
+        fit()
+        field = hand.page.locator(".numbers input").first
+        typed = round(float(field.input_value()) + 0.01, 3)
+        field.fill(str(typed))  # not yet committed
+        arrive()
+        assert field.input_value() == str(typed) and "discarded" in hand.text(".report")
+        hand.press("Tab")
+        assert [x for x, *_ in poses(hand)] == [typed]
+
+        fit()
+        hand.press("Control+s")
+        assert "waiting for the fit of frame 0" in hand.text("#hint")
+        assert not hand.page.locator("#dialog").is_visible()
+        hand.press("ArrowRight")  # the fit is stored although another frame is shown
+        arrive()
+        hand.wait("document.getElementById('dialog').open")
+        [fitted] = poses(hand)
+        assert fitted[0] != typed and str(fitted[0]) in hand.text("#dialog")
+        hand.answer("save")
+        hand.wait(SAVED)
+        assert yaml.safe_load(annotation(settings).read_text())["object_poses"][0][
+            "translation"
+        ] == pytest.approx(fitted)
+
+        hand.press("o")
+        fit()
+        hand.click("Remove the pose")
+        held.pop().continue_()
+        hand.page.wait_for_timeout(300)
+        assert poses(hand) == [fitted]
 
 
 def test_the_contact_surface_is_painted_and_saved(settings: Path) -> None:
