@@ -18,7 +18,7 @@ from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import read_label_map
 from intercap_core.inputs.documents import read_yaml
-from intercap_core.inputs.files import MAX_TABLE_BYTES, UnreadableFile, printable, quoted, read_text
+from intercap_core.inputs.files import UnreadableFile, printable, quoted, read_text
 from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
@@ -381,7 +381,7 @@ def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]
     Empty lines and lines that begin with # are skipped.
     """
     try:
-        lines = read_text(path, MAX_TABLE_BYTES).splitlines()
+        lines = read_text(path).splitlines()
     except UnreadableFile as error:
         raise UserError(
             f"{path}: not a readable text file ({error.reason}); check the path in the settings, "

@@ -27,7 +27,7 @@ from intercap_core.annotate.yaml_entries import UnsupportedLayout
 from intercap_core.annotation import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import parse_yaml, yaml_fault
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, read_bytes
+from intercap_core.inputs.files import MAX_TEXT_BYTES, read_bytes
 
 NO_FILE = "none"  # digest if there is no file
 _BOM = b"\xef\xbb\xbf"
@@ -83,7 +83,7 @@ def read(path: Path) -> Document:
         note = f"a save of {path} was interrupted; the file is unchanged"
     if not path.exists():
         return Document(path, "", NO_FILE, {}, note=note)
-    data = read_bytes(path, MAX_SETTINGS_BYTES)
+    data = read_bytes(path, MAX_TEXT_BYTES)
     digest = hashlib.sha256(data).hexdigest()
     try:
         text = data.decode("utf-8-sig")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.inputs.arrays import PICKLE_ERRORS
-from intercap_core.inputs.files import MAX_MODEL_BYTES, UnreadableFile, check_file
+from intercap_core.inputs.files import MAX_FILE_BYTES, UnreadableFile, check_file
 
 # Functions that build tensors from the storages of a file
 _ALLOWED = {
@@ -75,7 +75,7 @@ def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
 
     Raises UnreadableFile if the file is missing, too large or damaged, or contains no dictionary.
     """
-    size = check_file(path, MAX_MODEL_BYTES, advice=advice)
+    size = check_file(path, MAX_FILE_BYTES, advice=advice)
     try:
         unpacked = _unpacked_bytes(path)
         if unpacked > size:  # torch.save does not compress

@@ -16,7 +16,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, UnreadableFile, quoted, read_text
+from intercap_core.inputs.files import UnreadableFile, quoted, read_text
 from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
@@ -50,7 +50,7 @@ class Definition:
         if path is None:
             return cls.unknown()
         try:
-            lines = read_text(path, MAX_SETTINGS_BYTES).splitlines()
+            lines = read_text(path).splitlines()
         except UnreadableFile as error:
             raise UserError(
                 f"{path}: no readable text ({error.reason}); name a table that "

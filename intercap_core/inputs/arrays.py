@@ -15,7 +15,6 @@ import numpy as np
 
 from intercap_core.inputs.files import (
     MAX_ARRAYS_BYTES,
-    MAX_PICKLE_BYTES,
     MAX_UNPACKING,
     MIN_UNPACKED_BYTES,
     UnreadableFile,
@@ -118,7 +117,7 @@ def read_pickle(path: Path) -> Any:
     Python 2 pickles are read as latin-1, as numpy advises. Raises UnreadableFile if the file is
     missing, damaged or names anything else.
     """
-    content = read_bytes(Path(path), MAX_PICKLE_BYTES)
+    content = read_bytes(Path(path))
     try:
         return _Unpickler(io.BytesIO(content), encoding="latin1").load()
     except PICKLE_ERRORS as error:

@@ -16,13 +16,7 @@ from typing import Any
 
 import yaml
 
-from intercap_core.inputs.files import (
-    MAX_CALIBRATION_BYTES,
-    MAX_SETTINGS_BYTES,
-    UnreadableFile,
-    read_bytes,
-    read_text,
-)
+from intercap_core.inputs.files import MAX_TEXT_BYTES, UnreadableFile, read_bytes, read_text
 
 MIN_INTEGER, MAX_INTEGER = -(1 << 63), (1 << 64) - 1
 _LONG_INTEGER = b"0" * 19  # the fewest digits of an integer beyond 64 bits
@@ -75,31 +69,30 @@ def _bounded(text: str) -> int | float:
 
 def read_json(
     path: Path,
-    limit: int = MAX_CALIBRATION_BYTES,
     *,
     advice: str = "correct it",
     entry: Callable[[dict[str, Any]], Any] | None = None,
 ) -> Any:
-    """Parse a JSON file of at most ``limit`` bytes; raises UnreadableFile."""
-    content = read_bytes(path, limit)
+    """Parse a JSON file of at most ``MAX_TEXT_BYTES``; raises UnreadableFile."""
+    content = read_bytes(path, MAX_TEXT_BYTES)
     try:
         return parse_json(content.decode("utf-8-sig"), entry)
     except ValueError as error:
         raise UnreadableFile(path, f"is not valid JSON ({error})", advice) from None
 
 
-def read_object(path: Path, limit: int = MAX_CALIBRATION_BYTES) -> dict[str, Any]:
+def read_object(path: Path) -> dict[str, Any]:
     """Parse a JSON file that holds an object; raises UnreadableFile."""
-    content = read_json(path, limit)
+    content = read_json(path)
     if not isinstance(content, dict):
         kind = type(content).__name__
         raise UnreadableFile(path, f"expected names and values, found {kind}", "correct it")
     return content
 
 
-def read_toml(path: Path, limit: int = MAX_CALIBRATION_BYTES) -> dict[str, Any]:
-    """Parse a TOML file of at most ``limit`` bytes; raises UnreadableFile."""
-    text = read_text(path, limit)
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file of at most ``MAX_TEXT_BYTES``; raises UnreadableFile."""
+    text = read_text(path)
     try:
         return {key: _bounded_values(value) for key, value in tomllib.loads(text).items()}
     except RecursionError:
@@ -216,18 +209,17 @@ def yaml_fault(error: Exception) -> str:
 
 def read_yaml(
     path: Path,
-    limit: int = MAX_SETTINGS_BYTES,
     *,
     loader: type[YamlLoader] = YamlLoader,
     prepared: Callable[[str], str] | None = None,
 ) -> Any:
-    """Parse a YAML file of at most ``limit`` bytes; ``prepared`` changes its text first.
+    """Parse a YAML file of at most ``MAX_TEXT_BYTES``; ``prepared`` changes its text first.
 
     Raises UnreadableFile if it is missing, too large or malformed.
     """
     if not os.path.lexists(path):
         raise UnreadableFile(path, "there is no such file")
-    text = read_text(path, limit)
+    text = read_text(path)
     try:
         return parse_yaml(text if prepared is None else prepared(text), loader)
     except (yaml.YAMLError, ValueError) as error:

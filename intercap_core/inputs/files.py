@@ -17,12 +17,8 @@ import numpy as np
 from intercap_core.errors import UserError
 
 # Size limits, bytes: several times the size of the largest real file of each kind.
-MAX_SETTINGS_BYTES = 1 << 20  # written by hand; YAML is parsed at about a megabyte a second
-MAX_TABLE_BYTES = 1 << 24  # a line for each of 100,000 recordings
-MAX_CALIBRATION_BYTES = 1 << 24  # JSON, YAML or TOML of a hundred cameras
-MAX_MODEL_BYTES = 1 << 29  # COLMAP's images and their points; a mesh; network weights
-MAX_IMAGE_BYTES = 1 << 28  # one image file
-MAX_PICKLE_BYTES = 1 << 28  # results of an hour at 30 frames a second
+MAX_TEXT_BYTES = 1 << 24  # settings, a table of 100,000 recordings, a calibration of 100 cameras
+MAX_FILE_BYTES = 1 << 29  # COLMAP's points, a mesh, an image, a pickle, network weights, COCO JSON
 MAX_ARRAYS_BYTES = 1 << 30  # arrays of an .npz unpacked; SMPL-X's have 350 MB
 MAX_UNPACKING = 100  # bytes unpacked per byte of an .npz; deflate reaches 1,032 for zeros
 MIN_UNPACKED_BYTES = 1 << 26  # up to this size, any ratio is accepted
@@ -52,7 +48,11 @@ class UnreadableFile(UserError):
 
 
 def read_bytes(
-    path: Path, limit: int, *, advice: str = "check the path", head: int | None = None
+    path: Path,
+    limit: int = MAX_FILE_BYTES,
+    *,
+    advice: str = "check the path",
+    head: int | None = None,
 ) -> bytes:
     """Return the content of a regular file of at most ``limit`` bytes, or its first ``head`` bytes.
 
@@ -130,7 +130,7 @@ def _is_folder_in(content: bytes, name: bytes) -> bool:
     return bool(re.search(re.escape(name) + rb"[/\\]", content))
 
 
-def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:
+def read_text(path: Path, limit: int = MAX_TEXT_BYTES, *, advice: str = "check the path") -> str:
     """Return the text of a regular file, UTF-8 with or without a byte order mark."""
     return decode_text(path, read_bytes(path, limit, advice=advice))
 

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.inputs.documents import dump_yaml, parse_integer
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, UnreadableFile, read_text
+from intercap_core.inputs.files import UnreadableFile, read_text
 
 FOLDER = re.compile(
     r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
@@ -90,7 +90,7 @@ def _contact(
     if not path.is_file():
         return None
     try:
-        values = [parse_integer(word) for word in read_text(path, MAX_SETTINGS_BYTES).split()]
+        values = [parse_integer(word) for word in read_text(path).split()]
     except (UnreadableFile, ValueError):
         faults.append("contact.txt is not a list of frame numbers")
         return None
@@ -119,7 +119,7 @@ def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str
         return None
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(read_text(path, MAX_SETTINGS_BYTES))
+        parser.read_string(read_text(path))
         translation, rotation = (
             [float(word) for word in parser[section][key].split()]
             for section, key in (("init_trans", "trans"), ("init_rot", "rot"))

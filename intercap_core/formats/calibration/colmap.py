@@ -26,7 +26,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.inputs.documents import parse_integer
 from intercap_core.inputs.files import (
-    MAX_MODEL_BYTES,
+    MAX_FILE_BYTES,
     decode_text,
     printable,
     quoted,
@@ -151,7 +151,7 @@ def _unsupported(model: str, where: str) -> UserError:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    text = read_text(path, MAX_MODEL_BYTES, advice="export the model again")
+    text = read_text(path, MAX_FILE_BYTES, advice="export the model again")
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.lstrip().startswith("#"):
             yield number, line.strip()
@@ -203,7 +203,7 @@ class _Bytes:
 
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
-        self._content = read_bytes(path, MAX_MODEL_BYTES, advice="export the model again")
+        self._content = read_bytes(path, advice="export the model again")
 
     def take(self, form: str) -> tuple[Any, ...]:
         """Read the next values; ``form`` is a format of :mod:`struct` without byte order."""

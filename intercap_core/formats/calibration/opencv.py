@@ -28,7 +28,7 @@ from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intr
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs.documents import YamlLoader, read_json, read_yaml
-from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, UnreadableFile, parse_numbers, quoted
+from intercap_core.inputs.files import UnreadableFile, parse_numbers, quoted
 
 MIN_METRIC_RADIUS = 1e-4  # the Azure Kinect Sensor SDK takes a smaller radius as "not stated"
 # Between the colour and the depth lens of a camera; beyond it, the file is in millimetres.
@@ -423,7 +423,6 @@ def load_opencv(path: Path) -> dict[str, Any]:
         else:  # OpenCV's first line, %YAML:1.0, is not YAML
             content = read_yaml(
                 path,
-                MAX_CALIBRATION_BYTES,
                 loader=_Loader,
                 prepared=lambda text: text.removeprefix("%YAML:1.0"),
             )

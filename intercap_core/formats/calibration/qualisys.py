@@ -31,7 +31,7 @@ from intercap_core.formats.calibration.opencv import (
     parse_image_size,
 )
 from intercap_core.inputs.files import (
-    MAX_CALIBRATION_BYTES,
+    MAX_TEXT_BYTES,
     UnreadableFile,
     printable,
     quoted,
@@ -62,7 +62,7 @@ def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibra
 
 def _parse(path: Path) -> ElementTree.Element:
     try:
-        content = read_bytes(path, MAX_CALIBRATION_BYTES)
+        content = read_bytes(path, MAX_TEXT_BYTES)
         # Without the zeros of UTF-16. Comments and CDATA also begin with "<!".
         if re.search(rb"<!\s*(DOCTYPE|ENTITY)", content.replace(b"\0", b"")):
             raise UserError(f"{path}: declares a document type or entities; remove them")

@@ -30,7 +30,6 @@ from intercap_core.inputs.files import UnreadableFile, quoted, read_bytes
 
 Result = TypeVar("Result")
 
-MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
 HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
 MAX_SCORE = 1.2  # the overlaps that Segment Anything predicts slightly exceed 1
 LARGEST_ID = 2**31 - 1
@@ -205,7 +204,7 @@ def read_json(path: Path) -> Any:
 
 def _bytes(path: Path, head: int | None = None) -> bytes:
     try:
-        return read_bytes(path, MAX_JSON_BYTES, head=head)
+        return read_bytes(path, head=head)
     except UnreadableFile as error:
         smaller = "; write masks as compressed RLE, or one file an image"
         is_large = " MB, at most" in error.reason

@@ -28,7 +28,7 @@ from intercap_core.formats.recordings.source import CameraRecording, Image, Reco
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.solve.time_series import sample_evenly
-from intercap_core.inputs.files import MAX_IMAGE_BYTES, UnreadableFile, read_bytes
+from intercap_core.inputs.files import UnreadableFile, read_bytes
 
 
 class Decoding(NamedTuple):
@@ -105,7 +105,7 @@ def _check_depth_size(actual: tuple[int, ...], size: tuple[int, int]) -> None:
 def read_content(path: Path, length: int | None = None) -> bytes:
     """Bytes of an image file, or its first ``length``; raises :class:`DamagedImage`."""
     try:
-        return read_bytes(path, MAX_IMAGE_BYTES, head=length)
+        return read_bytes(path, head=length)
     except UnreadableFile as error:
         raise DamagedImage(error.reason) from None
 

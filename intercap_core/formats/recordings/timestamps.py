@@ -10,7 +10,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import ImagePair
-from intercap_core.inputs.files import MAX_TABLE_BYTES, quoted, read_text
+from intercap_core.inputs.files import quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
@@ -29,7 +29,7 @@ def read_timestamps(path: Path) -> Timestamps:
     Returns the times by name, or by 0, 1, ... if the lines have no names. Raises UserError naming
     file and line for text that is no number, for a repeated name, and for milliseconds.
     """
-    lines = read_text(path, MAX_TABLE_BYTES).splitlines()
+    lines = read_text(path).splitlines()
     times: dict[str | int, float] = {}
     for number, line in enumerate(lines, start=1):
         fields = [field for field in re.split(r"[,;\s]+", line.strip().lstrip("#")) if field]

@@ -24,8 +24,6 @@ from PIL import Image
 
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import (
-    MAX_IMAGE_BYTES,
-    MAX_MODEL_BYTES,
     UnreadableFile,
     printable,
     read_bytes,
@@ -49,7 +47,7 @@ def load_mesh(path: Path) -> Any:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: is no mesh that is read; export it as {', '.join(SUFFIXES)}")
-    content = read_bytes(path, MAX_MODEL_BYTES)
+    content = read_bytes(path)
     stated = _stated_faces(path, content) if suffix == ".ply" else 0
     if suffix == ".glb":
         _refuse_extensions(path, content)
@@ -91,7 +89,7 @@ def file_vertices(path: Path, mesh: Any) -> np.ndarray:
     coordinates, and another order if the faces have several materials.
     """
     if path.suffix.lower() == ".obj":
-        lines = map(bytes.split, _plain_obj(read_bytes(path, MAX_MODEL_BYTES)).splitlines())
+        lines = map(bytes.split, _plain_obj(read_bytes(path)).splitlines())
         try:
             return np.array([words[1:4] for words in lines if words[:1] == [b"v"]], np.float64)
         except ValueError:
@@ -149,7 +147,7 @@ class _FolderResolver(trimesh.resolvers.Resolver):
     def get(self, key: Any) -> bytes:
         name = Path(str(key).strip().replace("\\", "/")).name
         try:
-            return read_bytes(self._folder / name, MAX_IMAGE_BYTES)
+            return read_bytes(self._folder / name)
         except UnreadableFile as error:
             raise OSError(str(error)) from None
 
