@@ -58,8 +58,8 @@ def test_only_regular_files_up_to_the_limit_are_read(name: str, tmp_path: Path) 
         lambda path: read_bytes(path, 1000, head=10),
         lambda path: check_file(path, 1000),
         lambda path: read_text(path, 1000),
-        lambda path: read_json(path, 1000),
-        lambda path: read_toml(path, 1000),
+        read_json,
+        read_toml,
         read_arrays,
         read_pickle,
     ]
