@@ -19,7 +19,7 @@ JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 TIFF_STARTS = (b"II*\0", b"MM\0*")
 JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; an error of about 1 grey level
-RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
+RAW_FORMATS = ("NV12", "YUY2", "BGRA")
 # Markers but those within a scan: stuffed bytes and restarts.
 _MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 

@@ -7,6 +7,7 @@ tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the S
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import struct
@@ -128,9 +129,9 @@ class KinectFile(ClosedOnExit):
     def packets(self) -> Iterator[Packet]:
         """Yield all packets in the file's order, one at a time; call once.
 
-        Raw data of another size than an image's is left out and counted in ``broken_packets``. A
-        damaged JPEG is yielded, because it counts in the numbers of the images. A file that was cut
-        off ends early without an error.
+        Depth of another size than an image's is left out and counted in ``broken_packets``. Damaged
+        colour is yielded, because it counts in the numbers of the images. A file that was cut off
+        ends early without an error.
         """
         streams = [self._container.streams[index] for index in self._streams]
         for packet in video.demux(self._container, streams, self._count_broken):
@@ -148,18 +149,11 @@ class KinectFile(ClosedOnExit):
         self.broken_packets += 1
 
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
-        """Whether a packet holds a JPEG, raw data of an image's size, or inertial samples."""
-        if kind == "colour" and self.info.colour_format == "MJPG":
+        """Whether a packet holds colour, a depth image of the mode's size, or inertial samples."""
+        if kind != "depth":
             return True
-        if kind == "colour":
-            width, height = COLOUR_MODES[self.info.colour_mode].size
-            return len(content) == round(
-                width * height * encodings.RAW_FORMATS[self.info.colour_format]
-            )
-        if kind == "depth" and self.info.depth_mode is not None:
-            width, height = DEPTH_MODES[self.info.depth_mode].size
-            return len(content) == 2 * width * height
-        return kind == "imu"
+        width, height = DEPTH_MODES[self.info.depth_mode].size if self.info.depth_mode else (0, 0)
+        return 0 < len(content) == 2 * width * height
 
     def preview(self) -> RecordingPreview:
         """Inspect the colour track without reading the others."""
@@ -374,7 +368,8 @@ class KinectRecording(CameraRecording):
     def images(self) -> Iterator[Image]:
         """Yield colour packets as recorded and lossless depth; find gravity from the accelerometer.
 
-        Raw colour is stored as JPEG, with a note; raw it would be ten times as large.
+        Raw colour is stored as JPEG, with a note; raw it would be ten times as large. Raw colour of
+        another size than an image's becomes an empty image.
         """
         info = self._recording.info
         counts = {"colour": 0, "depth": 0}
@@ -390,10 +385,10 @@ class KinectRecording(CameraRecording):
             if packet.kind == "depth":
                 content = self._recording.depth_image(packet.content)
             elif info.colour_format != "MJPG":
-                size = COLOUR_MODES[info.colour_mode].size
-                content = encodings.encode_jpeg(
-                    encodings.decode_raw(packet.content, info.colour_format, size)
-                )
+                size, content = COLOUR_MODES[info.colour_mode].size, b""
+                with contextlib.suppress(ValueError):
+                    image = encodings.decode_raw(packet.content, info.colour_format, size)
+                    content = encodings.encode_jpeg(image)
             yield Image(packet.kind, packet.device_time_us, content)
         if info.colour_format != "MJPG":
             self.notes.append(
