@@ -86,7 +86,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
             raise DamagedImage("is cut off")
         if content[24:26] == b"\x10\0":
             raise DamagedImage("is a 16-bit grey PNG, as depth is; move depth files to depth/")
-        whole, (orientation, _) = content, _exif_orientation(content.partition(b"eXIf")[2])
+        whole, orientation = content, stated_orientation(content)
     elif content.startswith((*TIFF_STARTS, b"BM")):
         kind = "BMP" if content.startswith(b"BM") else "TIFF"
         orientation, at = _exif_orientation(content)  # of a BMP: 1
@@ -121,6 +121,12 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
         f"{JPEG_QUALITY}"
     )
     return encode_jpeg(turn(image, orientation)), "; ".join(remarks)
+
+
+def stated_orientation(content: bytes) -> int:
+    """Orientation, 1 to 8, that a PNG or TIFF file states; 1 without an entry."""
+    tiff = content.partition(b"eXIf")[2] if content.startswith(PNG_START) else content
+    return _exif_orientation(tiff)[0]
 
 
 def turn(image: np.ndarray, orientation: int) -> np.ndarray:

@@ -22,6 +22,7 @@ from intercap_core.formats.recordings.encodings import (
     decode,
     encoded_size,
     holds_all_pixels,
+    stated_orientation,
     store_colour,
 )
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
@@ -60,7 +61,8 @@ def read_colour(path: Path, orientation: OrientationUse = "turn") -> tuple[bytes
 def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.ndarray:
     """Decode a 16-bit PNG or TIFF of one channel to (H, W) uint16, millimetres.
 
-    Raises :class:`DamagedImage` for anything else, and for another ``size`` (width, height).
+    Raises :class:`DamagedImage` for anything else, for another ``size`` (width, height), and for
+    files that state an orientation: OpenCV would turn TIFF and not PNG files, and never the lens.
 
     Args:
         path: the file.
@@ -74,6 +76,12 @@ def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.n
             raise DamagedImage("is cut off")
     elif not content.startswith(TIFF_STARTS):
         raise DamagedImage("is no PNG or TIFF")
+    orientation = stated_orientation(content)
+    if orientation != 1:
+        raise DamagedImage(
+            f"states orientation {orientation}, the depth lens none; turn the depth images, or "
+            "remove the entry (exiftool -Orientation= FILES)"
+        )
     image = decode(content, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]

@@ -8,9 +8,9 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from intercap_core.formats.recordings.encodings import (
-    RAW_FORMATS,
     DamagedImage,
     decode_raw,
     encode_jpeg,
@@ -83,9 +83,9 @@ def test_encoding_changes_little():
     assert np.abs(decoded.astype(int) - picture(640, 480)).mean() < 1
 
 
-@pytest.mark.parametrize("name", RAW_FORMATS)
-def test_raw_images_of_another_size_are_refused(name):
-    content = bytes(round(64 * 48 * RAW_FORMATS[name]))
+@pytest.mark.parametrize(("name", "pixel_bytes"), [("NV12", 1.5), ("YUY2", 2), ("BGRA", 4)])
+def test_raw_images_of_another_size_are_refused(name, pixel_bytes):
+    content = bytes(round(64 * 48 * pixel_bytes))
     assert decode_raw(content, name, (64, 48)).shape == (48, 64, 3)
     with pytest.raises(ValueError, match="reshape"):
         decode_raw(content[:-1], name, (64, 48))
@@ -187,6 +187,19 @@ def test_a_tiff_is_turned_once_or_not_at_all(orientation, order):
         stored, remark = store_colour(content, use)
         assert shown(stored).shape == true.shape and ("orientation" in remark) == (orientation > 1)
         assert np.abs(shown(stored).astype(int) - true).mean() < 2
+
+
+@pytest.mark.parametrize("form", ["TIFF", "PNG"])
+def test_depth_that_states_an_orientation_is_refused(tmp_path, form):
+    depth, exif, path = np.arange(6, dtype=np.uint16).reshape(2, 3), Image.Exif(), tmp_path / "d"
+    for orientation in range(1, 9):
+        exif[0x0112], exif[0x0132] = orientation, "9999:99:99 99:99:99"  # no time that exists
+        Image.fromarray(depth).save(path, form, exif=exif)
+        if orientation == 1:
+            np.testing.assert_array_equal(read_depth(path, (3, 2)), depth)
+        else:
+            with pytest.raises(DamagedImage, match=f"orientation {orientation}, the depth lens no"):
+                read_depth(path, (3, 2))
 
 
 def test_heads_that_state_too_many_pixels_are_damage(tmp_path):
