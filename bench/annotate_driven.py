@@ -223,13 +223,13 @@ def _start(box: list[float], at: Point, by: Point) -> Point:
     return at if inside else (x + wide / 2 - by[0] / 4, y + high / 2 - by[1] / 4)
 
 
-def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
+def correct_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
     """Answer the questions, then place the object in lost frames, run, and repeat."""
     errors = measure(project, name)
     before = float(errors.lost.mean())
     print(f"{name}: lost in {int(errors.lost.sum())} of {len(errors.lost)} frames")
     if not before:
-        raise UserError(f"{name}: the object is lost in no frame; there is nothing to mend")
+        raise UserError(f"{name}: the object is lost in no frame; there is nothing to correct")
     eye = Eye.of(project, name)
     placing = Placing(hand, eye)
     posed: set[int] = set()
@@ -295,7 +295,7 @@ def _frames_to_place(lost: np.ndarray, posed: set[int], apart: int) -> list[int]
 # --- contact -----------------------------------------------------------------------------------
 
 
-def mend_contact(project: Project, name: str, hand: Hand) -> dict[str, float]:
+def correct_contact(project: Project, name: str, hand: Hand) -> dict[str, float]:
     """Drag, split, delete and add intervals on the timeline until they match the truth."""
     before, meshes_before, true = contact_figures(project, name)
     print(f"{name}: contact F1 {before:.3f}, of the fitted meshes {meshes_before:.3f}")
@@ -434,13 +434,13 @@ def measure_sessions(settings: Path, cores: int) -> dict[str, float]:
     compute_without_annotations(project, cores)
     found: dict[str, float] = {}
     actions, seconds, whole = 0, 0.0, True
-    for name, mend in ((OBJECT, mend_object), (CONTACT, mend_contact)):
+    for name, correct in ((OBJECT, correct_object), (CONTACT, correct_contact)):
         try:
             with open_page(settings, name, cores) as hand:
-                found |= mend(project, name, hand)
+                found |= correct(project, name, hand)
                 actions, seconds = actions + hand.actions, seconds + hand.seconds
         except (UserError, TimeoutError, Error) as error:
-            print(f"{name}: was not mended: {error}", file=sys.stderr)
+            print(f"{name}: was not corrected: {error}", file=sys.stderr)
             whole = False
     if whole:
         found |= {"annotate.clicks": float(actions), "annotate.seconds": round(seconds, 1)}

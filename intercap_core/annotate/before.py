@@ -125,7 +125,9 @@ def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
         metrics = SequenceMetrics.read(paths["metrics"])
         for error in stated_errors(metrics):
             stated = error.stated if np.isfinite(error.stated) else None
-            rows[f"{error.part}, stated error, mm"] = None if stated is None else round(stated, 1)
+            rows[f"{error.part}, estimated error, mm"] = (
+                None if stated is None else round(stated, 1)
+            )
         rows["flagged frames"] = int(metrics.values["flagged"].sum())
         if metrics.has_object:
             rows["frames in contact"] = int(metrics.values["contact_frame"].sum())

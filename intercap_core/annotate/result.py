@@ -296,7 +296,7 @@ def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[st
     for first, last in runs(high):
         worst = first + int(np.nanargmax(by_frame[first : last + 1]))
         ratio = float(by_frame[worst] / error)
-        message = f"the verdict states {1e3 * by_frame[worst]:.0f} mm for the {part} here"
+        message = f"estimated error of the {part}: {1e3 * by_frame[worst]:.0f} mm"
         yield _place(first, last, "verdict", message, min(ratio, 3.0), worst)
 
 

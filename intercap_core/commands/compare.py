@@ -61,7 +61,7 @@ def _table(comparison: Comparison) -> Table:
     for head, _, _ in _COLUMNS:
         table.add_column(head, justify="right")
     table.add_column("flagged", justify="right")
-    table.add_column("body stated, mm", justify="right")
+    table.add_column("body estimated error, mm", justify="right")
     shown = comparison.sequences[comparison.sequences["state"] != SAME].head(ROWS)
     for row in shown.to_dict("records"):
         cells = [_number(row[key], digits) for _, key, digits in _COLUMNS]

@@ -61,7 +61,7 @@ def contents(root: Path) -> dict[str, str]:
 def default_settings() -> str:
     """config.yaml with every default below its description."""
     lines = [
-        "# Settings of a dataset. Every line but the dataset's name is a default and may go.",
+        "# Settings of a dataset. Only the dataset's name is required.",
         "# config/README.md lists allowed values; paths are relative to this file.",
         "# yaml-language-server: $schema=schemas/config.json",
     ]

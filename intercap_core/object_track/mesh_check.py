@@ -121,8 +121,8 @@ def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:
         # 100, a cup at twice the noise 14.
         if likely < 10:
             doubts.append(
-                f"the images hardly show this mesh ({likely:.0f} nats in half of the frames, "
-                "expected 10 and more); check that it is this object"
+                "the images hardly support this mesh (median log-likelihood ratio "
+                f"{likely:.0f}, expected at least 10); check that it is this object"
             )
     return doubts + _scale_doubt(observer, frames, believed) + symmetry_doubt(observer)
 
@@ -167,8 +167,8 @@ def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[i
     scale = max(gains, key=lambda scale: gains[scale])
     word = "larger" if scale > 1 else "smaller"
     return [
-        f"the images fit a mesh {abs(scale - 1):.0%} {word} better (by {gains[scale]:.0f} nats a "
-        "frame); check the mesh's size"
+        f"the images fit a mesh {abs(scale - 1):.0%} {word} better (log-likelihood ratio larger by "
+        f"{gains[scale]:.0f} per frame); check the mesh's size"
     ]
 
 

@@ -74,7 +74,7 @@ class Proposals:
             self._observer.places.claim(self._observer.mesh.centre_at(likeliest.pose))
         for _, t, fits in results:
             self._follow(t, fits)
-        log.info("first frame %d, %.0f nats", first, best)
+        log.info("first frame %d, log-likelihood ratio %.0f", first, best)
         return first
 
     def add_annotated(self, given: GivenPose) -> bool:

@@ -84,7 +84,11 @@ def notes(stage: str, path: Path) -> list[str]:
             parts = zip(
                 artefact.text("verdict/part_names"), artefact.text("verdict/silent"), strict=True
             )
-            found += [f"no error of the {part} is stated: {text}" for part, text in parts if text]
+            found += [
+                f"the error of the {part} cannot be estimated: {text}"
+                for part, text in parts
+                if text
+            ]
         return list(dict.fromkeys(found))
 
 
@@ -196,7 +200,7 @@ def _metrics(a: Artefact) -> str:
             for part, e, factor in stated
             if np.isfinite(e)
         ]
-    errors = f"stated errors: {', '.join(parts)}; " if parts else ""
+    errors = f"estimated errors: {', '.join(parts)}; " if parts else ""
     return f"{errors}{_share(a['flagged'])} frames flagged"
 
 

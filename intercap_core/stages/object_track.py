@@ -124,7 +124,7 @@ def _absence(track: Track) -> str:
     if track.shows_nothing:
         return (
             f"the track in {accepted} of {len(track.frames)} frames is rejected, as the images do "
-            f"not support it ({track.evidence:.0f} nats, expected at least "
+            f"not support it (log-likelihood ratio {track.evidence:.0f}, expected at least "
             f"{NOTHING_LOG_RATIO:.0f})"
         )
     return ""

@@ -32,7 +32,7 @@ SAYS = {
     "object_track": "tracked in 4 of 5 frames, 0 of them ambiguous",
     "body_fit": "fitted in 5 of 5 frames",
     "joint": "3 steps, 0 refused, converged (last step 0.2 mm); contact in 0 of 5 frames, 2 not",
-    "metrics": "stated errors: body ",
+    "metrics": "estimated errors: body ",
     "summary": "5 frames, 4 flagged, ",
 }
 

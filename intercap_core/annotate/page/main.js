@@ -351,11 +351,11 @@ function doubts(app) {
   const { info } = app, verdict = info.verdict ?? [];
   const warnings = [info.track?.doubts, info.subject?.doubts].filter(Boolean);
   return make("div", {},
-    verdict.length ? make("p", {}, "Stated errors: ", verdict.map(({ part, mm, silent }) => `${part} ${mm === null ? `– (${silent})` : `${mm} mm`}`).join(", "), ".") : null,
+    verdict.length ? make("p", {}, "Estimated errors (no ground truth): ", verdict.map(({ part, mm, silent }) => `${part} ${mm === null ? `– (${silent})` : `${mm} mm`}`).join(", "), ".") : null,
     warnings.map((text) => make("p", { class: "fault" }, text)),
     info.places.length ? make("ol", { class: "places" }, info.places.slice(0, 60).map((place) => make("li", {},
       button(`${place.first === place.last ? place.first : `${place.first}–${place.last}`}: ${place.message}`, () => app.show(place.frame), { class: "plain" }))))
-      : make("p", {}, info.frames && info.verdict ? "There are no flags or doubts." : "There is no verdict yet."));
+      : make("p", {}, info.frames && info.verdict ? "There are no flags or doubts." : "Flags and errors are not computed yet: run the stages."));
 }
 
 function showInfo(info) {

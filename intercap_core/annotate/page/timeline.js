@@ -215,7 +215,7 @@ export class Timeline {
     } }, new Option("add contact here…", ""), ...["any", ...contact.regions].map((part) => new Option(readable(part), part)));
     choose.setAttribute("aria-label", "Add contact at this frame");
     const state = contact.stated ? !contact.stated.length ? "the annotation states that nothing touches"
-      : `${contact.stated.length} intervals stated, ${contact.stated.filter((interval) => !contact.isConfirmed(interval)).length} of them unconfirmed`
+      : `${contact.stated.length} ${contact.stated.length === 1 ? "interval" : "intervals"} stated, ${contact.stated.filter((interval) => !contact.isConfirmed(interval)).length} of them unconfirmed`
       : contact.probability ? "estimated contact: the first edit copies it into the annotation" : "no contact has been estimated yet";
     refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(selected ? [
       make("b", {}, `${readable(selected.part)} ${selected.start}–${selected.end - 1}`),

@@ -56,11 +56,11 @@ def reach_verdict(
     ]
     for part, estimate in zip(parts, estimates, strict=True):
         if estimate.silent:
-            log.warning("%s: no stated error: %s", part, estimate.silent)
+            log.warning("%s: error cannot be estimated: %s", part, estimate.silent)
             continue
         error, factor = 1e3 * estimate.error, estimate.factor
         low, high = error / factor, error * factor
-        log.info("%s: stated error %.1f mm (%.1f to %.1f)", part, error, low, high)
+        log.info("%s: estimated error %.1f mm (%.1f to %.1f)", part, error, low, high)
     values: Values = {
         "part_names": [str(part) for part in parts],
         "feature_names": list(FEATURES),

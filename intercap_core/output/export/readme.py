@@ -65,12 +65,12 @@ def readme(
 
 
 def _stated_errors(errors: Sequence[StatedError]) -> str:
-    """Describe the errors stated without truth."""
+    """Describe the errors estimated without truth."""
     stated = [
         f"{e.part} {e.stated:.1f} mm ({e.stated / e.factor:.1f} to {e.stated * e.factor:.1f})"
         for e in errors
         if not e.silent
     ]
-    silent = [f"none is stated of the {e.part}: {e.silent}" for e in errors if e.silent]
+    silent = [f"no estimate for the {e.part}: {e.silent}" for e in errors if e.silent]
     words = [f"mean {', '.join(stated)}"] if stated else []
     return "; ".join([*words, *silent])

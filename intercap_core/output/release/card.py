@@ -51,8 +51,8 @@ CONVENTIONS = {
     "parameters give another person",
     "contact": "probability by frame and body region that it touches the object",
     "flags": "frames that the program does not trust, with reasons; exclude them",
-    "errors": "stated without truth, by cameras held out: the true error is within the factor in "
-    "four of five cases",
+    "errors": "estimated without ground truth, by cameras held out: the true error is "
+    "within the factor in four of five cases",
 }
 FORMATS = {
     "intercap": "*/export/intercap/res.pkl and res.npz: as the InterCap release",
