@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
@@ -104,10 +105,7 @@ def check_range(path: Path, name: str, values: np.ndarray) -> None:
 
 _PERSON, _OBJECT_FIT = "person", "fit01"
 _VERTICES = 6890  # of SMPL and SMPL-H
-_JOINTS = {156: 52, 72: 24}  # of SMPL-H and SMPL, by the numbers of a pose
-_BODY_JOINTS = 22  # pelvis to wrists, in one order in SMPL, SMPL-H and SMPL-X
-_HAND_JOINTS = slice(22, 52)  # of SMPL-H, in SMPL-X's order
-_SMPLX_HANDS = slice(25, 55)  # of the 55 joints of SMPL-X: after the jaw and the two eyes
+_POSE_SIZES = (156, 72)  # numbers of a pose of SMPL-H, of SMPL
 
 
 class Skin(NamedTuple):
@@ -200,7 +198,7 @@ def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
 
     Jaw and eyes are at rest, and so are fingers in SMPL's poses.
     """
-    if poses.ndim != 2 or poses.shape[1] not in _JOINTS:
+    if poses.ndim != 2 or poses.shape[1] not in _POSE_SIZES:
         size = poses.shape[-1] if poses.ndim else 1
         raise UserError(
             f"{path}: a pose has {size} numbers, expected the 156 of SMPL-H or the 72 of SMPL"
@@ -208,11 +206,14 @@ def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
     if not np.isfinite(poses).all():
         raise UserError(f"{path}: a pose has values that are no numbers; get the file again")
     check_range(path, "a pose", poses)
-    rotations = poses.reshape(len(poses), _JOINTS[poses.shape[1]], 3)
-    result = np.zeros((len(poses), 55, 3))
-    result[:, :_BODY_JOINTS] = rotations[:, :_BODY_JOINTS]
-    if rotations.shape[1] == _JOINTS[156]:
-        result[:, _SMPLX_HANDS] = rotations[:, _HAND_JOINTS]
+    rotations = poses.reshape(len(poses), -1, 3)
+    result = np.zeros((len(poses), NUM_JOINTS, 3))
+    # The order from pelvis to wrists is that of SMPL-X. SMPL-H has no jaw and no eyes.
+    body = JOINT_INDEX["jaw"]
+    result[:, :body] = rotations[:, :body]
+    fingers = result[:, FIRST_FINGER:]
+    if rotations.shape[1] == body + fingers.shape[1]:
+        fingers[:] = rotations[:, body:]
     return result
 
 

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from pycocotools import mask as coco_mask
 
-_ZERO = 48  # "0", the first character of COCO's alphabet
+_ZERO = ord("0")  # the first character of COCO's alphabet
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
 
 

@@ -29,7 +29,6 @@ NEAR_M = 0.05
 # Margin of the window around the projected vertices, pixels: in known lenses, distorted edges reach
 # beyond the bounding box of their corners by less than this.
 BOX_MARGIN_PX = 2
-NO_FACE = -1
 
 
 class Renderer:
@@ -281,8 +280,8 @@ def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
 def _blank(height, width):
     """Return empty buffers of a window (h, w): depth, face, body."""
     depth = np.full((height, width), np.float32(np.inf), np.float32)
-    face = np.full((height, width), np.int32(NO_FACE), np.int32)
-    body = np.full((height, width), np.int16(NO_FACE), np.int16)
+    face = np.full((height, width), -1, np.int32)
+    body = np.full((height, width), -1, np.int16)
     return depth, face, body
 
 
