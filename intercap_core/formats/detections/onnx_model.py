@@ -19,12 +19,17 @@ from intercap_core.formats.detections.class_names import parse_class_names
 from intercap_core.inputs.files import check_file, printable, referenced_files
 
 FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
-# Mean of ImageNet, blue first, as in Caffe's models; maskrcnn-benchmark subtracts it.
-CAFFE_MEAN_BGR = np.array([102.9801, 115.9465, 122.7717], np.float32)
-# Mean and standard deviation of ImageNet, red first; torchvision and mmpose normalise with them.
-IMAGENET_MEAN_RGB = np.array([123.675, 116.28, 103.53], np.float32)
-IMAGENET_DEVIATION_RGB = np.array([58.395, 57.12, 57.375], np.float32)
 PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
+
+# Offset and scale of each channel: an input is (grey level - offset) / scale.
+_NORMALISATION: dict[PixelValues, tuple[list[float], list[float]]] = {
+    "rgb": ([0, 0, 0], [255, 255, 255]),
+    "bgr255": ([0, 0, 0], [1, 1, 1]),
+    # mean of ImageNet, blue first, as in Caffe's models; maskrcnn-benchmark subtracts it
+    "bgr_mean": ([102.9801, 115.9465, 122.7717], [1, 1, 1]),
+    # mean and standard deviation of ImageNet, red first, as in torchvision and mmpose
+    "imagenet": ([123.675, 116.28, 103.53], [58.395, 57.12, 57.375]),
+}
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
@@ -178,14 +183,8 @@ class OnnxModel:
             canvas = canvas[..., ::-1]
         if self._dtype == np.uint8:
             return canvas.transpose(2, 0, 1)
-        pixels = canvas.astype(np.float32)
-        if values == "rgb":
-            pixels /= 255
-        elif values == "imagenet":
-            pixels = (pixels - IMAGENET_MEAN_RGB) / IMAGENET_DEVIATION_RGB
-        elif values == "bgr_mean":
-            pixels -= CAFFE_MEAN_BGR
-        return pixels.transpose(2, 0, 1)
+        offset, scale = np.array(_NORMALISATION[values], np.float32)
+        return ((canvas - offset) / scale).transpose(2, 0, 1)
 
 
 def place_picture(picture: tuple[int, int], size: tuple[int, int], *, centred: bool) -> Fit:
