@@ -41,7 +41,6 @@ class Box:
 
 
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) and faces (F, 3)
-FLOOR = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M
 Furnishing = Literal["furnished", "sparse", "bare"]
 
 
@@ -89,7 +88,8 @@ def build_room(
         if twin is not None:
             stand, mesh = _twin(rng, eyes, *twin)
             boxes += stand
-    surfaces = [("floor", FLOOR, np.array([[0, 2, 1], [1, 2, 3]]))]
+    corners = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M
+    surfaces = [("floor", corners, np.array([[0, 2, 1], [1, 2, 3]]))]
     surfaces += [(box.material, *_box_mesh(box)) for box in boxes]
     surfaces += [("distractor", *mesh)] if mesh is not None else []
     names = list(dict.fromkeys(name for name, _, _ in surfaces))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS, PARENTS
+from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS, PARENTS
 
 # The twelve standard people; people of other builds, whose file has only the arrays that differ.
 SUBJECTS_FILE = Path(__file__).parent / "data" / "subjects.npz"
@@ -31,7 +31,7 @@ _DRIVERS = tuple(
     for joint in ("elbow", "knee", "hip", "shoulder")
     for side in ("left", "right")
 )
-_TIP_JOINTS = [*range(27, 40, 3), *range(42, 55, 3)]
+_TIP_JOINTS = [*range(FIRST_FINGER, NUM_JOINTS)][2::3]
 _PARENTS = np.array(PARENTS)
 _DUAL_QUATERNION_SHARE = 0.5
 
@@ -260,7 +260,10 @@ def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarra
 SOLE_M = 0.022  # thickness of the sole below the lowest skin
 LEATHER_M = (0.010, 0.015)  # thickness at the sides
 SLOPING = 0.3  # downward component of the normals of skin above the sole
-FEET = ((7, 10), (8, 11))  # joints: ankle and ball of the left foot, of the right one
+# Joints: ankle and ball of the left foot, of the right one.
+FEET = [
+    [JOINT_INDEX[f"{side}_{joint}"] for joint in ("ankle", "foot")] for side in ("left", "right")
+]
 
 
 def shoe_area(subject: Subject) -> np.ndarray:
@@ -298,12 +301,20 @@ def _top(subject: Subject) -> float:
     return float(subject.rest_joints[[7, 8], 1].mean()) + 0.01
 
 
-SKIN = ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66))
-HAIR = ((0.10, 0.07, 0.05), (0.28, 0.18, 0.10), (0.16, 0.15, 0.15), (0.45, 0.32, 0.18))
-SHIRTS = ((0.25, 0.38, 0.62), (0.60, 0.62, 0.64), (0.55, 0.22, 0.20), (0.20, 0.42, 0.30),
-          (0.80, 0.72, 0.45))  # fmt: skip
-TROUSERS = ((0.13, 0.15, 0.24), (0.30, 0.28, 0.25), (0.10, 0.10, 0.11), (0.42, 0.40, 0.36))
-SHOES = ((0.12, 0.12, 0.13), (0.75, 0.75, 0.74), (0.35, 0.20, 0.12))
+# Colours, RGB in [0, 1], from which :func:`body_colours` draws.
+PALETTES = {
+    "skin": ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66)),
+    "hair": ((0.10, 0.07, 0.05), (0.28, 0.18, 0.10), (0.16, 0.15, 0.15), (0.45, 0.32, 0.18)),
+    "shirt": (
+        (0.25, 0.38, 0.62),
+        (0.60, 0.62, 0.64),
+        (0.55, 0.22, 0.20),
+        (0.20, 0.42, 0.30),
+        (0.80, 0.72, 0.45),
+    ),
+    "trousers": ((0.13, 0.15, 0.24), (0.30, 0.28, 0.25), (0.10, 0.10, 0.11), (0.42, 0.40, 0.36)),
+    "shoes": ((0.12, 0.12, 0.13), (0.75, 0.75, 0.74), (0.35, 0.20, 0.12)),
+}
 
 
 def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:
@@ -317,20 +328,21 @@ def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:
     def of(*names: str) -> np.ndarray:
         return share[:, [JOINT_INDEX[n] for n in names]].sum(1)
 
-    def pick(palette: tuple[tuple[float, float, float], ...]) -> np.ndarray:
+    def pick(name: str) -> np.ndarray:
+        palette = PALETTES[name]
         return np.array(palette[rng.integers(len(palette))]) * rng.uniform(0.92, 1.06)
 
-    colours = np.tile(pick(SKIN), (len(rest), 1))
+    colours = np.tile(pick("skin"), (len(rest), 1))
     dressed = subject.clothing > 0.001
     legs = of("left_hip", "right_hip", "left_knee", "right_knee") + of("pelvis")
-    colours[dressed] = pick(SHIRTS)
-    colours[dressed & (legs > 0.5)] = pick(TROUSERS)
-    colours[shoe_area(subject)] = pick(SHOES)
+    colours[dressed] = pick("shirt")
+    colours[dressed & (legs > 0.5)] = pick("trousers")
+    colours[shoe_area(subject)] = pick("shoes")
     eyes = joints[[JOINT_INDEX["left_eye_smplhf"], JOINT_INDEX["right_eye_smplhf"]]].mean(0)
     head = of("head") > 0.5
     scalp = rest[:, 1] > eyes[1] + 0.045
     nape = (rest[:, 2] < eyes[2] - 0.095) & (rest[:, 1] > eyes[1] - 0.07)
-    colours[head & (scalp | nape)] = pick(HAIR)
+    colours[head & (scalp | nape)] = pick("hair")
     is_eye = of("left_eye_smplhf", "right_eye_smplhf") > 0.5
     colours[is_eye] = (0.92, 0.92, 0.92)
     pupil = is_eye & (rest[:, 2] > rest[is_eye, 2].max() - 0.003) if is_eye.any() else is_eye
