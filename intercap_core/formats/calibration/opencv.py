@@ -33,7 +33,7 @@ from intercap_core.inputs.files import UnreadableFile, parse_numbers, quoted
 MIN_METRIC_RADIUS = 1e-4  # the Azure Kinect Sensor SDK takes a smaller radius as "not stated"
 # Between the colour and the depth lens of a camera; beyond it, the file is in millimetres.
 MAX_LENSES_APART_M = 1.0
-MAX_SIDE = 32_768  # px of an image; the largest sensors have half of it
+MAX_SIDE = 16_384  # px of an image; no sensor has more
 _MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
 
 

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from intercap_core.formats.calibration.opencv import MAX_SIDE
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
 
-MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
 MASK_THRESHOLD = 128  # grey level of 8 bits; JPEG blurs the two values of a mask
 # Coordinates from 0 to 1, somewhat more outside the image, are shares of its width and height.
 MAX_SHARE = 2.0
@@ -143,7 +143,7 @@ def _from_rle(
         not isinstance(stated, list)
         or len(stated) != 2
         or not all(type(n) is int and n > 0 for n in stated)
-        or stated[0] * stated[1] > MAX_PIXELS
+        or max(stated) > MAX_SIDE
     ):
         raise ValueError(
             f"the mask's size is {quoted(stated)}, expected [{size[1]}, {size[0]}] (height, "

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from intercap_core.formats.calibration.opencv import MAX_SIDE
 from intercap_core.formats.detections.class_names import MAX_LABEL
 from intercap_core.formats.detections.instance import (
     MASK_THRESHOLD,
-    MAX_PIXELS,
     PERSON_LABEL,
     Instance,
     make_instance,
@@ -54,7 +54,7 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     """
     content = read_content(file.path)
     stored = encoded_size(content)
-    if stored is None or stored[0] * stored[1] > MAX_PIXELS:
+    if stored is None or max(stored) > MAX_SIDE:
         raise DamagedImage("is no image" if stored is None else "is too large an image")
     image = _decode(content, file.numbered)
     try:

@@ -17,7 +17,7 @@ import av
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.opencv import check_rate
+from intercap_core.formats.calibration.opencv import MAX_SIDE, check_rate
 from intercap_core.formats.recordings.encodings import (
     JPEG_QUALITY,
     DamagedImage,
@@ -47,7 +47,6 @@ from intercap_core.inputs.files import UnreadableFile, check_file
 # FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
 LATEST_US = 10**15  # of a device's clock: thirty years; later times are damage
-MAX_SIDE = 16_384  # px of an image that is decoded
 # Exif orientation by the matrix [a b; c d] of a track, with x' = a x + c y and y' = b x + d y.
 # Source: ISO/IEC 14496-12, 8.3.2.
 _ORIENTATIONS = {
