@@ -97,6 +97,7 @@ class Annotator:
             if self.project.annotation_made(name)
             else document.locked(self.project.annotation_path(name)),
             "profile": str(self.runs.profile or ""),
+            "uncertainty_frames": self.project.config.joint.annotation_uncertainty_frames,
             "project": hashlib.sha256(str(self.settings.resolve()).encode()).hexdigest()[:16],
         }
 

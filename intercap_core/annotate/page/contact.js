@@ -78,11 +78,11 @@ export class Contact {
     this.#store(all, unconfirmed, "contact moved");
   }
 
-  /* Mark both ends as uncertain, or as exact if one is uncertain. */
-  toggleUncertain(interval) {
+  /* Mark the "start" or "end" as exact or uncertain. */
+  setExact(interval, end, on) {
     const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
     if (k < 0) return;
-    all[k] = interval.uncertain ? exact(exact(all[k], "start"), "end") : { ...all[k], uncertain: "both" };
+    all[k] = on ? exact(all[k], end) : { ...all[k], uncertain: isUncertain(all[k], OTHER[end]) ? "both" : end };
     unconfirmed.delete(id(interval));
     this.selected = all[k];
     this.#store(all, unconfirmed, "uncertainty of contact changed");
@@ -161,10 +161,12 @@ export class Contact {
   }
 }
 
+export const OTHER = { start: "end", end: "start" };
+export const isUncertain = ({ uncertain }, end) => uncertain === "both" || uncertain === end;
+
 /* The interval with an exact "start" or "end". */
 function exact({ uncertain, ...interval }, end) {
-  const other = { start: "end", end: "start" }[end];
-  return uncertain === "both" || uncertain === other ? { ...interval, uncertain: other } : interval;
+  return isUncertain({ uncertain }, OTHER[end]) ? { ...interval, uncertain: OTHER[end] } : interval;
 }
 
 export const id = (interval) => `${interval.part}:${interval.start}:${interval.end}`;

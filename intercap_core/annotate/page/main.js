@@ -346,16 +346,17 @@ class App {
   }
 }
 
-/* The panel of stated errors, doubts and places to check. */
+/* The panel of estimated errors, doubts and places to check. */
 function doubts(app) {
   const { info } = app, verdict = info.verdict ?? [];
   const warnings = [info.track?.doubts, info.subject?.doubts].filter(Boolean);
+  const none = info.verdict ? "No frame is flagged or doubtful." : "Flags and errors are not computed yet: run the stages.";
   return make("div", {},
     verdict.length ? make("p", {}, "Estimated errors (no ground truth): ", verdict.map(({ part, mm, silent }) => `${part} ${mm === null ? `– (${silent})` : `${mm} mm`}`).join(", "), ".") : null,
     warnings.map((text) => make("p", { class: "fault" }, text)),
     info.places.length ? make("ol", { class: "places" }, info.places.slice(0, 60).map((place) => make("li", {},
       button(`${place.first === place.last ? place.first : `${place.first}–${place.last}`}: ${place.message}`, () => app.show(place.frame), { class: "plain" }))))
-      : make("p", {}, info.frames && info.verdict ? "There are no flags or doubts." : "Flags and errors are not computed yet: run the stages."));
+      : warnings.length ? null : make("p", {}, none));
 }
 
 function showInfo(info) {

@@ -1,6 +1,6 @@
 /* The timeline: flags, doubts, dropped frames, object poses, left and right, and contact by body part. */
 import { button, find, make, refill, readable } from "./dom.js";
-import { id } from "./contact.js";
+import { OTHER, id, isUncertain } from "./contact.js";
 import { posedFrames } from "./pose.js";
 import { sidesRows } from "./sides_panel.js";
 
@@ -156,7 +156,7 @@ export class Timeline {
     if (part !== "any" && contact.probability) {
       lane.append(this.#heat((t) => contact.probabilityAt(part, t)));
     }
-    for (const interval of contact.intervals()) if (interval.part === part) lane.append(this.#interval(interval));
+    for (const interval of contact.intervals()) if (interval.part === part) lane.append(this.#interval(interval), ...this.#uncertainEnds(interval));
     return row;
   }
 
@@ -176,6 +176,16 @@ export class Timeline {
       });
     };
     return bar;
+  }
+
+  /* Hatched frames around the uncertain ends of an interval, within which a run may move them. */
+  #uncertainEnds(interval) {
+    const { uncertainty_frames: by, frames } = this.app.info;
+    return Object.keys(OTHER).filter((end) => this.contact.stated && isUncertain(interval, end) && interval[end] > 0 && interval[end] < frames).map((end) => {
+      const zone = make("div", { class: "uncertain" });
+      this.#place(zone, Math.max(0, interval[end] - by), Math.min(frames, interval[end] + by));
+      return zone;
+    });
   }
 
   /* Drag a bar or one of its ends. `store` saves the new ends and returns the data-interval of the bar. */
@@ -207,7 +217,7 @@ export class Timeline {
   }
 
   #contactBar() {
-    const { app, contact } = this, selected = contact.selectedAt(app.frame);
+    const { app, contact } = this, { info } = app, selected = contact.selectedAt(app.frame);
     const choose = make("select", { id: "part", onchange: () => {
       if (!choose.value) return;
       this.extra.add(choose.value);
@@ -220,7 +230,9 @@ export class Timeline {
     refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(selected ? [
       make("b", {}, `${readable(selected.part)} ${selected.start}–${selected.end - 1}`),
       button("Confirm", () => contact.confirm(selected), { title: "C" }),
-      button(selected.uncertain ? "Ends exact" : "Ends uncertain", () => contact.toggleUncertain(selected), { title: "The fit may move uncertain ends by a few frames (joint.annotation_uncertainty_frames); exact ends hold" }),
+      ...Object.keys(OTHER).map((end) => make("label", { title: `A run may move an uncertain ${end} by ${info.uncertainty_frames} frames (joint.annotation_uncertainty_frames), and keeps an exact one` },
+        make("input", { type: "checkbox", checked: !isUncertain(selected, end), data: { exact: end }, onchange: (event) => contact.setExact(selected, end, event.target.checked) }),
+        ` ${end} exact${isUncertain(selected, end) ? ` (± ${info.uncertainty_frames} frames)` : ""}`)),
       button("Starts here", () => contact.change(selected, app.frame, selected.end), { title: "[" }),
       button("Ends here", () => contact.change(selected, selected.start, app.frame + 1), { title: "]" }),
       button("Split here", () => contact.split(selected, app.frame), { title: "K" }),

@@ -4,6 +4,7 @@ import { apply, project } from "./geometry.js";
 
 const PREFETCHED = 4; // frames that are fetched ahead
 const MAX_ZOOM = 16;
+const PADDING = 8; // of the views' box, CSS pixels
 const QUALITY = "intercap-images"; // storage key of the chosen image size
 
 export class Views {
@@ -15,7 +16,7 @@ export class Views {
     find("large").onchange = () => { this.large = Number(find("large").value); this.arrange(); };
     find("quality").value = storedQuality() ?? "1";
     find("quality").onchange = () => { storeQuality(find("quality").value); app.show(app.frame); };
-    new ResizeObserver(() => app.redraw()).observe(find("views"));
+    new ResizeObserver(() => this.#fit()).observe(find("views"));
     this.arrange();
   }
 
@@ -133,7 +134,28 @@ export class Views {
     const cells = this.order.map((index) => this.views[index]);
     find("big").replaceChildren(...cells.slice(0, this.large).map((view) => view.figure));
     find("strip").replaceChildren(...cells.slice(this.large).map((view) => view.figure));
-    find("big").dataset.count = Math.min(this.large, cells.length);
+    this.#fit();
+  }
+
+  /* Choose the numbers of columns with the largest images that fit into the page without scrolling. A small
+   * window is scrolled instead. */
+  #fit() {
+    const [big, strip] = [find("big"), find("strip")], box = find("views"), [l, s] = [big.children.length, strip.children.length];
+    const width = box.clientWidth - 2 * PADDING;
+    const height = getComputedStyle(box).overflowY === "auto" ? box.clientHeight - find("bar").offsetHeight - 3 * PADDING : Infinity;
+    const ratio = Math.max(...this.views.map(({ camera }) => camera.size[1] / camera.size[0]), 0.1);
+    let best = { area: 0 };
+    for (let columns = 1; columns <= Math.max(l, 1); columns += 1) {
+      for (let small = columns + 1; small <= Math.max(s, columns + 1); small += 1) { // smaller than the large views
+        const rows = Math.ceil(l / columns) / columns + Math.ceil(s / small) / small; // in widths of the page
+        const share = Math.min(1, height / (rows * ratio * width)), area = share ** 2 * (l / columns ** 2 + s / small ** 2);
+        if (area > best.area) best = { area, columns, small, share };
+      }
+    }
+    for (const [grid, columns] of [[big, best.columns], [strip, best.small]]) {
+      grid.style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
+      grid.style.width = `${best.share * width}px`;
+    }
     this.app.redraw();
   }
 

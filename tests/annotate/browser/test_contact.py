@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.annotate.browser.hand import HAND, SAVED, open_page
 from tests.annotate.served import annotation, served
 from tests.helpers.browser import needs_chromium
@@ -28,6 +30,13 @@ def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
         assert [interval["start"] for interval in hand.draft("contact")] == [2, 4]
         hand.press("Delete")
         assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 4} | START]
+        hatched, lane = hand.box(".uncertain"), hand.box('[data-part="right_hand"] .lane')
+        assert hatched[0] == lane[0] and hatched[2] == pytest.approx(0.7 * lane[2], abs=1)
+        hand.page.locator(HAND).focus()
+        for end in ("end", "start"):
+            hand.page.locator(f"[data-exact={end}]").click()
+        assert hand.draft("contact")[0]["uncertain"] == "end"
+        hand.press("Control+z", "Control+z")
         assert "+  - {part: right_hand, start: 2, end: 4, uncertain: start}" in hand.open_save()
         hand.answer("save")
         hand.wait(SAVED)

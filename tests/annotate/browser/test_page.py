@@ -132,6 +132,12 @@ def test_a_step_is_drawn_in_all_views_in_time(settings: Path) -> None:
     from bench.annotate_page import WATCH, steps_ms
 
     with served(settings) as server, open_page(server) as hand:
+        assert hand.page.evaluate(  # all views are visible, and the largest that are
+            """() => { const views = document.getElementById("views");
+              return views.scrollHeight === views.clientHeight
+                && document.getElementById("strip").lastChild.getBoundingClientRect().bottom
+                  > views.getBoundingClientRect().bottom - 150; }"""
+        )
         hand.page.evaluate(WATCH)
         steps = steps_ms(hand.page, 9)
     assert float(np.median(steps[:, 0])) < PATIENCE * STEP_MS, steps
@@ -142,6 +148,11 @@ def test_keys_work_wherever_the_focus_is(settings: Path) -> None:
         hand.page.locator('[data-layer="body"]').focus()
         hand.press("Space")
         assert not hand.app("layers.body") and not hand.app("playing")
+        hand.page.evaluate(
+            "Object.assign(annotate.info, { places: [], track: { doubts: 'a doubtful mesh' } })"
+        )
+        hand.app("panels()")
+        assert hand.text("#panels").endswith("a doubtful mesh")  # not also "No frame is flagged"
         hand.page.locator("#tab-marks").click()
         hand.page.get_by_role("button", name="Drop frame 0").focus()
         hand.press("Enter")
