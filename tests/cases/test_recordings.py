@@ -8,9 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.recordings.image_files import ImagePair
 from intercap_core.formats.recordings.layouts import open_layout
+from intercap_core.formats.recordings.timestamps import pair_images
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
 from intercap_core.scene.depth_scale import describe_depth_scale
@@ -84,6 +87,47 @@ def test_colour_as_tiff_is_read(tmp_path):
         assert "3 colour images are TIFF" in opened.notes[0]
     assert difference(cv2.imdecode(np.frombuffer(images[1], np.uint8), 1), true) < 3
     assert any("images are 64x48" in fault for fault in check(project).faults)
+
+
+def pairs(names: list[str], depth: list[str], fps: float | None = 30.0) -> list[ImagePair]:
+    files, depth_files = [Path(name) for name in names], [Path(name) for name in depth]
+    return pair_images(files, depth_files, fps=fps, offset_s=0, times=None, source=Path("k1"))
+
+
+def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):
+    """Of https://github.com/lifelong-robotic-vision/OpenLORIS-Scene/issues/10."""
+    names = ["1560000083.949189.png", "1560000083.982551.png", "1560000084.015913.png"]
+    shots = pairs(names, ["1560000083.950000.png", "1560000084.017000.png"], fps=None)
+    colour = {shot.time_us: shot.colour.name for shot in shots if shot.colour}
+    assert list(colour.items()) == [
+        (1560000083949189 + 33362 * n, name) for n, name in enumerate(names)
+    ]
+    assert [shot.time_us for shot in shots if shot.depth] == [1560000083950000, 1560000084017000]
+    assert [shot.time_us for shot in pairs(["k1.0000.png", "k1.0002.png"], [])] == [0, 66_667]
+    with pytest.raises(UserError, match="number both alike"):
+        pairs(names, ["0000.png"])
+
+
+@pytest.mark.parametrize(
+    ("names", "fps", "unit"),
+    [
+        (["033", "066", "100", "133"], 30, "milliseconds"),
+        (["1000", "1040", "1080"], 25, "milliseconds"),
+        (["k1_1616161616000", "k1_1616161616033", "k1_1616161616067"], 30, "milliseconds"),
+        (["0_33333", "1_66667", "2_100000"], 30, "microseconds"),
+        (["color_0-1633342743123.45", "color_1-1633342744156.78"], 30, "milliseconds"),
+        (["2", "4", "6"], 30, ""),
+        (["000", "030", "060"], 30, ""),
+        (["3", "17", "29", "44"], 30, ""),
+    ],
+)
+def test_numbers_that_are_times_are_refused(names, fps, unit):
+    """Of https://github.com/realsenseai/librealsense/issues/9820."""
+    if not unit:
+        assert len(pairs([f"{name}.png" for name in names], [], fps)) == len(names)
+        return
+    with pytest.raises(UserError, match=f"likely {unit}"):
+        pairs([f"{name}.png" for name in names], [], fps)
 
 
 @pytest.mark.parametrize("unit", [None, 0.0002])

@@ -14,6 +14,7 @@ from intercap_core.inputs.files import quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
+_DECIMAL = re.compile(r"(\d+)\.\d+(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
 
 
@@ -52,13 +53,18 @@ def read_timestamps(path: Path) -> Timestamps:
         if abs(seconds) > LATEST_S:
             raise UserError(f"{path}, line {number}: {seconds:.4g} are no seconds; write seconds")
         times[name] = seconds
-    steps = np.abs(np.diff(list(times.values())))
+    _check_seconds(path, list(times.values()))
+    return times
+
+
+def _check_seconds(path: Path, times: list[float]) -> None:
+    """Raise UserError, naming ``path``, if times are too far apart to be seconds."""
+    steps = np.abs(np.diff(times))
     if len(steps) and np.median(steps) > 5:  # not even a time lapse is so slow
         raise UserError(
             f"{path}: times are {np.median(steps):.4g} apart, expected seconds, so they are likely "
             "milliseconds or less; write seconds"
         )
-    return times
 
 
 def frame_rate(times_us: np.ndarray) -> float | None:
@@ -80,7 +86,9 @@ def pair_images(
     """Pair colour and depth files of one camera, with their times.
 
     Files are paired by the last number in their names, or by order if any name has no number of its
-    own. Raises UserError, naming ``source``, if times are unknown or missing.
+    own. Decimal numbers whose whole part changes (1305031102.175304.png) are times in seconds.
+    Raises UserError, naming ``source``, if times are unknown or missing, or if whole numbers in the
+    names are times.
 
     Args:
         colour: colour files.
@@ -91,17 +99,21 @@ def pair_images(
             name without suffix, by number, or one for each colour image in order.
         source: folder or video, for messages.
     """
-    pairs = _by_key(colour, depth, source)
+    pairs, named_by_time = _by_key(colour, depth, source)
     keys = sorted(pairs)
-    if times is None:
-        if fps is None:
-            raise UserError(
-                f"{source}: the times of the images are unknown; add fps to the calibration, "
-                "or a timestamps.csv"
-            )
-        seconds = {key: key / fps for key in keys}
-    else:
+    if times is not None:
         seconds = _stated(pairs, times, source)
+    elif named_by_time:
+        _check_seconds(source, [key for key in keys if pairs[key][0] or not colour])
+        seconds = {key: key for key in keys}
+    elif fps is None:
+        raise UserError(
+            f"{source}: the times of the images are unknown; add fps to the calibration, "
+            "or a timestamps.csv"
+        )
+    else:
+        _refuse_whole_times([key for key in keys if pairs[key][0] or not colour], fps, source)
+        seconds = {key: key / fps for key in keys}
     latest = max((abs(time + offset_s) for time in seconds.values()), default=0.0)
     if latest > LATEST_S:
         raise UserError(
@@ -115,11 +127,34 @@ def pair_images(
     ]
 
 
+def _refuse_whole_times(numbers: list[float], fps: float, source: Path) -> None:
+    """Raise UserError if sorted whole numbers of images are times in a fraction of a second.
+
+    They are if the median step is the period of ``fps``: exactly, or roughly if steps differ.
+    """
+    steps = np.diff(numbers)
+    if not len(steps) or np.median(steps) < 2:
+        return
+    tolerance = 0.25 if (steps % steps.min()).any() else 1e-9
+    for unit, name in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+        if abs(np.median(steps) * unit * fps - 1) <= tolerance:
+            raise UserError(
+                f"{source}: the numbers in the names are {np.median(steps):g} apart, so at "
+                f"{fps:g} images a second they are likely {name}; write a timestamps.csv in "
+                "seconds ('name, seconds')"
+            )
+
+
 def _by_key(
     colour: list[Path], depth: list[Path], source: Path
-) -> dict[int, tuple[Path | None, Path | None]]:
-    """Colour and depth file by number or, if any name has no number of its own, by position."""
-    by_number = [{_number(path): path for path in paths} for paths in (colour, depth)]
+) -> tuple[dict[float, tuple[Path | None, Path | None]], bool]:
+    """Colour and depth file by number or, if any name has no number of its own, by position.
+
+    The second value is whether the numbers are times in seconds.
+    """
+    by_time = any(_are_times(paths) for paths in (colour, depth))
+    number_of = _decimal if by_time else _number
+    by_number = [{number_of(path): path for path in paths} for paths in (colour, depth)]
     are_numbered = all(
         len(numbers) == len(paths) and None not in numbers
         for numbers, paths in zip(by_number, (colour, depth), strict=True)
@@ -137,17 +172,29 @@ def _by_key(
             {order.get(path.stem, index): path for index, path in enumerate(depth)},
         ]
     keys = {key for numbers in by_number for key in numbers if key is not None}
-    return {key: (by_number[0].get(key), by_number[1].get(key)) for key in keys}
+    pairs = {key: (by_number[0].get(key), by_number[1].get(key)) for key in keys}
+    return pairs, by_time and are_numbered
 
 
-def _number(path: Path) -> int | None:
+def _number(path: Path) -> float | None:
     match = re.search(r"\d+(?=\D*$)", path.stem)  # the last number of the name
     return int(match.group()) if match else None
 
 
+def _decimal(path: Path) -> float | None:
+    match = _DECIMAL.search(path.stem)
+    return float(match.group()) if match else None
+
+
+def _are_times(paths: list[Path]) -> bool:
+    """Whether all names end in decimal numbers, and not all of one whole part (k1.0001.png)."""
+    found = [_DECIMAL.search(path.stem) for path in paths]
+    return len({match[1] for match in found if match}) > 1 and None not in found
+
+
 def _stated(
-    pairs: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
-) -> dict[int, float]:
+    pairs: Mapping[float, tuple[Path | None, Path | None]], times: Timestamps, source: Path
+) -> dict[float, float]:
     """The stated time, seconds, of each key.
 
     Times without names belong to the colour images in order. If there are none, as for the depth
@@ -156,14 +203,14 @@ def _stated(
     coloured = [key for key in sorted(pairs) if pairs[key][0] is not None]
     if all(isinstance(name, int) for name in times):
         if not coloured:
-            return {key: times[key] for key in pairs if key in times}
+            return {key: times[int(key)] for key in pairs if key in times}
         if len(times) == len(coloured):
             return dict(zip(coloured, times.values(), strict=True))
         raise UserError(
             f"{source}: {len(times)} timestamps for {len(coloured)} colour images; write one for "
             "each, or 'name, seconds'"
         )
-    by_number = {
+    by_number: dict[float, float] = {
         int(name): time
         for name, time in times.items()
         if isinstance(name, str) and re.fullmatch(r"[0-9]{1,18}", name)
