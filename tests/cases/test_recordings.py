@@ -11,7 +11,7 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.formats.recordings.image_files import ImagePair
+from intercap_core.formats.recordings.image_files import ImagePair, read_depth
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.timestamps import pair_images
 from intercap_core.pipeline.step import run_step
@@ -87,6 +87,15 @@ def test_colour_as_tiff_is_read(tmp_path):
         assert "3 colour images are TIFF" in opened.notes[0]
     assert difference(cv2.imdecode(np.frombuffer(images[1], np.uint8), 1), true) < 3
     assert any("images are 64x48" in fault for fault in check(project).faults)
+
+
+@pytest.mark.parametrize("unit", [0.001, 0.0002])
+def test_the_largest_number_is_no_depth(tmp_path, unit):
+    """Of https://github.com/luxonis/depthai-docs-website/pull/156."""
+    depth = np.array([[0, 1000, 65_534], [65_535, 5000, 65_535]], np.uint16)
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    expected = np.where(depth == 65_535, 0, np.rint(depth * (unit / 0.001)))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png", (3, 2), unit), expected)
 
 
 def pairs(names: list[str], depth: list[str], fps: float | None = 30.0) -> list[ImagePair]:

@@ -59,8 +59,9 @@ def read_colour(path: Path, orientation: OrientationUse = "turn") -> tuple[bytes
 
 
 def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.ndarray:
-    """Decode a 16-bit PNG or TIFF of one channel to (H, W) uint16, millimetres.
+    """Decode a 16-bit PNG or TIFF of one channel to (H, W) uint16, millimetres, 0 = invalid.
 
+    The largest number, 65535, is invalid too: sensors write it where they measure nothing.
     Raises :class:`DamagedImage` for anything else, for another ``size`` (width, height), and for
     files that state an orientation: OpenCV would turn TIFF and not PNG files, and never the lens.
 
@@ -90,6 +91,7 @@ def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.n
             "calibration states its unit)"
         )
     _check_depth_size(image.shape[::-1], size)
+    image[image == np.iinfo(np.uint16).max] = 0
     if unit_m == 0.001:
         return image
     millimetres = np.rint(image * (1000 * unit_m))
