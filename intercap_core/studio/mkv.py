@@ -24,15 +24,31 @@ ColourFormat = Literal["MJPG", "NV12", "YUY2", "BGRA"]
 _COLOUR_BITS = {"MJPG": 24, "NV12": 12, "YUY2": 16, "BGRA": 32}  # a pixel, as the SDK writes them
 WiredSyncMode = Literal["STANDALONE", "MASTER", "SUBORDINATE"]
 
-_EBML, _SEGMENT, _SEEK_HEAD, _VOID = 0x1A45DFA3, 0x18538067, 0x114D9B74, 0xEC
-_INFO, _TRACKS, _ATTACHMENTS, _TAGS = 0x1549A966, 0x1654AE6B, 0x1941A469, 0x1254C367
-_CLUSTER, _CUES = 0x1F43B675, 0x1C53BB6B
+# Ids of elements by their names (RFC 8794, RFC 9559).
+_IDS = {
+    "EBML": 0x1A45DFA3, "Segment": 0x18538067, "SeekHead": 0x114D9B74, "Void": 0xEC,
+    "Info": 0x1549A966, "Tracks": 0x1654AE6B, "Attachments": 0x1941A469, "Tags": 0x1254C367,
+    "Cluster": 0x1F43B675, "Cues": 0x1C53BB6B, "EBMLVersion": 0x4286, "EBMLReadVersion": 0x42F7,
+    "EBMLMaxIDLength": 0x42F2, "EBMLMaxSizeLength": 0x42F3, "DocTypeVersion": 0x4287,
+    "DocTypeReadVersion": 0x4285, "MuxingApp": 0x4D80, "WritingApp": 0x5741, "Title": 0x7BA9,
+    "FileName": 0x466E, "FileMimeType": 0x4660, "FileData": 0x465C, "FileUID": 0x46AE,
+    "TrackNumber": 0xD7, "TrackUID": 0x73C5, "FlagLacing": 0x9C, "CodecPrivate": 0x63A2,
+    "DefaultDuration": 0x23E383, "Video": 0xE0, "BlockDuration": 0x9B, "Seek": 0x4DBB,
+    "SeekID": 0x53AB, "SeekPosition": 0x53AC, "DocType": 0x4282, "Duration": 0x4489,
+    "AttachedFile": 0x61A7, "TrackType": 0x83, "Name": 0x536E, "TrackEntry": 0xAE, "CodecID": 0x86,
+    "PixelWidth": 0xB0, "PixelHeight": 0xBA, "TargetType": 0x63CA, "TagTrackUID": 0x63C5,
+    "TagAttachmentUID": 0x63C6, "TagName": 0x45A3, "TagString": 0x4487, "Tag": 0x7373,
+    "Targets": 0x63C0, "SimpleTag": 0x67C8, "BlockGroup": 0xA0, "SimpleBlock": 0xA3,
+    "Timestamp": 0xE7, "CueTrackPositions": 0xB7, "CueTrack": 0xF7, "CueClusterPosition": 0xF1,
+    "CuePoint": 0xBB, "CueTime": 0xB3, "Block": 0xA1, "TimestampScale": 0x2AD7B1,
+}  # fmt: skip
 _UNKNOWN_SIZE = b"\x01" + b"\xff" * 7
 _SEEK_HEAD_BYTES = 256  # reserved for five entries; the rest is a Void element
 _VIDEO, _SUBTITLE = 1, 17  # TrackType
 
 
-def _id(number: int) -> bytes:
+def _id(name: str) -> bytes:
+    number = _IDS[name]
     return number.to_bytes((number.bit_length() + 7) // 8, "big")
 
 
@@ -43,17 +59,17 @@ def _size(length: int, width: int = 0) -> bytes:
     return (length | 1 << 7 * width).to_bytes(width, "big")
 
 
-def _element(number: int, payload: bytes, width: int = 0) -> bytes:
-    return _id(number) + _size(len(payload), width) + payload
+def _element(name: str, payload: bytes, width: int = 0) -> bytes:
+    return _id(name) + _size(len(payload), width) + payload
 
 
-def _unsigned(number: int, value: int, width: int = 0) -> bytes:
+def _unsigned(name: str, value: int, width: int = 0) -> bytes:
     width = width or max(1, (value.bit_length() + 7) // 8)
-    return _element(number, value.to_bytes(width, "big"))
+    return _element(name, value.to_bytes(width, "big"))
 
 
-def _text(number: int, value: str) -> bytes:
-    return _element(number, value.encode())
+def _text(name: str, value: str) -> bytes:
+    return _element(name, value.encode())
 
 
 class MkvWriter:
@@ -155,17 +171,16 @@ class MkvWriter:
         self._flush_cluster()
         positions = dict(self._positions)
         if self._cues:
-            positions[_CUES] = self._file.tell() - self._segment_start
-            self._file.write(_element(_CUES, b"".join(self._cues)))
+            positions["Cues"] = self._file.tell() - self._segment_start
+            self._file.write(_element("Cues", b"".join(self._cues)))
         end = self._file.tell()
-        # Seek: SeekID, SeekPosition
         entries = b"".join(
-            _element(0x4DBB, _element(0x53AB, _id(number)) + _unsigned(0x53AC, position, 8))
-            for number, position in positions.items()
+            _element("Seek", _element("SeekID", _id(name)) + _unsigned("SeekPosition", position, 8))
+            for name, position in positions.items()
         )
-        head = _element(_SEEK_HEAD, entries)
+        head = _element("SeekHead", entries)
         filler = _SEEK_HEAD_BYTES - len(head)
-        self._patch(self._segment_start, head + _element(_VOID, bytes(filler - 9), 8))
+        self._patch(self._segment_start, head + _element("Void", bytes(filler - 9), 8))
         self._patch(self._segment_start - 8, _size(end - self._segment_start, 8))
         self._patch(self._duration_at, struct.pack(">d", float(self._last_us)))
         self._file.close()
@@ -200,55 +215,55 @@ class MkvWriter:
         self, fps: int, calibration: bytes | None, tags: dict[str, tuple[str, str]]
     ) -> None:
         ebml = (
-            _unsigned(0x4286, 1)  # EBMLVersion
-            + _unsigned(0x42F7, 1)  # EBMLReadVersion
-            + _unsigned(0x42F2, 4)  # EBMLMaxIDLength
-            + _unsigned(0x42F3, 8)  # EBMLMaxSizeLength
-            + _text(0x4282, "matroska")
-            + _unsigned(0x4287, 2)  # DocTypeVersion
-            + _unsigned(0x4285, 2)  # DocTypeReadVersion
+            _unsigned("EBMLVersion", 1)
+            + _unsigned("EBMLReadVersion", 1)
+            + _unsigned("EBMLMaxIDLength", 4)
+            + _unsigned("EBMLMaxSizeLength", 8)
+            + _text("DocType", "matroska")
+            + _unsigned("DocTypeVersion", 2)
+            + _unsigned("DocTypeReadVersion", 2)
         )
-        self._file.write(_element(_EBML, ebml) + _id(_SEGMENT) + _UNKNOWN_SIZE)
+        self._file.write(_element("EBML", ebml) + _id("Segment") + _UNKNOWN_SIZE)
         self._segment_start = self._file.tell()
-        self._file.write(_element(_VOID, bytes(_SEEK_HEAD_BYTES - 9), 8))
+        self._file.write(_element("Void", bytes(_SEEK_HEAD_BYTES - 9), 8))
 
-        self._positions: dict[int, int] = {}
+        self._positions: dict[str, int] = {}
         info = (
-            _unsigned(0x2AD7B1, TIMECODE_SCALE_NS)
-            + _text(0x4D80, "intercap")  # MuxingApp
-            + _text(0x5741, "intercap")  # WritingApp
-            + _text(0x7BA9, "Azure Kinect")  # Title
-            + _element(0x4489, bytes(8))  # Duration, filled in at the end
+            _unsigned("TimestampScale", TIMECODE_SCALE_NS)
+            + _text("MuxingApp", "intercap")
+            + _text("WritingApp", "intercap")
+            + _text("Title", "Azure Kinect")
+            + _element("Duration", bytes(8))  # filled in at the end
         )
-        self._top(_INFO, info)
+        self._top("Info", info)
         self._duration_at = self._file.tell() - 8
-        self._top(_TRACKS, b"".join(self._track_entry(n, i, fps) for n, i in self._tracks.items()))
+        self._top("Tracks", b"".join(self._track_entry(n, i, fps) for n, i in self._tracks.items()))
         if calibration is not None:
             attached = (
-                _text(0x466E, "calibration.json")  # FileName
-                + _text(0x4660, "application/octet-stream")  # FileMimeType
-                + _element(0x465C, calibration)  # FileData
-                + _unsigned(0x46AE, self._uid("calibration.json"))  # FileUID
+                _text("FileName", "calibration.json")
+                + _text("FileMimeType", "application/octet-stream")
+                + _element("FileData", calibration)
+                + _unsigned("FileUID", self._uid("calibration.json"))
             )
-            self._top(_ATTACHMENTS, _element(0x61A7, attached))
-        self._top(_TAGS, b"".join(self._tag(name, *value) for name, value in tags.items()))
+            self._top("Attachments", _element("AttachedFile", attached))
+        self._top("Tags", b"".join(self._tag(name, *value) for name, value in tags.items()))
 
-    def _top(self, number: int, payload: bytes) -> None:
+    def _top(self, name: str, payload: bytes) -> None:
         """Write an element of the Segment and remember its position for the index."""
-        self._positions[number] = self._file.tell() - self._segment_start
-        self._file.write(_element(number, payload))
+        self._positions[name] = self._file.tell() - self._segment_start
+        self._file.write(_element(name, payload))
 
     def _track_entry(self, name: str, number: int, fps: int) -> bytes:
         """The TrackEntry of a track."""
         entry = (
-            _unsigned(0xD7, number)  # TrackNumber
-            + _unsigned(0x73C5, self._uid(name))  # TrackUID
-            + _unsigned(0x83, _SUBTITLE if name == "IMU" else _VIDEO)
-            + _unsigned(0x9C, 0)  # FlagLacing
-            + _text(0x536E, name)
+            _unsigned("TrackNumber", number)
+            + _unsigned("TrackUID", self._uid(name))
+            + _unsigned("TrackType", _SUBTITLE if name == "IMU" else _VIDEO)
+            + _unsigned("FlagLacing", 0)
+            + _text("Name", name)
         )
         if name == "IMU":
-            return _element(0xAE, entry + _text(0x86, "S_K4A/IMU"))
+            return _element("TrackEntry", entry + _text("CodecID", "S_K4A/IMU"))
         if name == "COLOR":
             (width, height), bits = self._colour_size, _COLOUR_BITS[self._colour_format]
             four_cc = self._colour_format.encode()
@@ -261,23 +276,23 @@ class MkvWriter:
             "<IiiHH4sIiiII", 40, width, height, 1, bits, four_cc, image_bytes, 0, 0, 0, 0
         )
         entry += (
-            _text(0x86, "V_MS/VFW/FOURCC")
-            + _element(0x63A2, header)  # CodecPrivate
-            + _unsigned(0x23E383, 1_000_000_000 // fps)  # DefaultDuration
-            + _element(0xE0, _unsigned(0xB0, width) + _unsigned(0xBA, height))  # Video
+            _text("CodecID", "V_MS/VFW/FOURCC")
+            + _element("CodecPrivate", header)
+            + _unsigned("DefaultDuration", 1_000_000_000 // fps)
+            + _element("Video", _unsigned("PixelWidth", width) + _unsigned("PixelHeight", height))
         )
-        return _element(0xAE, entry)
+        return _element("TrackEntry", entry)
 
     def _tag(self, name: str, value: str, about: str) -> bytes:
         """The element of a tag, for the whole file if ``about`` is ""."""
-        # Tag: Targets (TargetType; TagTrackUID or TagAttachmentUID), SimpleTag (TagName, TagString)
         target = b""
         if about in self._tracks:
-            target = _text(0x63CA, "TRACK") + _unsigned(0x63C5, self._uid(about))
+            target = _text("TargetType", "TRACK") + _unsigned("TagTrackUID", self._uid(about))
         elif about:
-            target = _text(0x63CA, "ATTACHMENT") + _unsigned(0x63C6, self._uid(about))
-        simple = _text(0x45A3, name) + _text(0x4487, value)
-        return _element(0x7373, _element(0x63C0, target) + _element(0x67C8, simple))
+            uid = _unsigned("TagAttachmentUID", self._uid(about))
+            target = _text("TargetType", "ATTACHMENT") + uid
+        simple = _text("TagName", name) + _text("TagString", value)
+        return _element("Tag", _element("Targets", target) + _element("SimpleTag", simple))
 
     def _write_image(self, name: str, image: np.ndarray, device_time_us: int) -> None:
         expected = self._depth_size and self._depth_size[::-1]
@@ -304,11 +319,11 @@ class MkvWriter:
             self._cluster_tracks.add(track)
         block = _size(track) + struct.pack(">h", relative)
         if name == "IMU":
-            group = _element(0xA1, block + b"\x00" + payload) + _unsigned(0x9B, 1)  # BlockDuration
-            self._cluster.append(_element(0xA0, group))
+            group = _element("Block", block + b"\x00" + payload) + _unsigned("BlockDuration", 1)
+            self._cluster.append(_element("BlockGroup", group))
         else:
             head = block + b"\x80"  # a key frame
-            self._cluster.append(_id(0xA3) + _size(len(head) + len(payload)) + head + payload)
+            self._cluster += [_id("SimpleBlock"), _size(len(head) + len(payload)), head, payload]
         self._last_us = max(self._last_us, time_us)
 
     def _flush_cluster(self) -> None:
@@ -316,14 +331,14 @@ class MkvWriter:
         if not self._cluster or self._cluster_us is None:
             return
         position = self._file.tell() - self._segment_start
-        time = _unsigned(0xE7, self._cluster_us)
+        time = _unsigned("Timestamp", self._cluster_us)
         length = len(time) + sum(len(block) for block in self._cluster)
-        self._file.write(_id(_CLUSTER) + _size(length, 8) + time)
+        self._file.write(_id("Cluster") + _size(length, 8) + time)
         self._file.writelines(self._cluster)
         track = min(self._cluster_tracks, default=self._tracks["COLOR"])
-        # CuePoint: CueTime, CueTrackPositions (CueTrack, CueClusterPosition)
-        where = _element(0xB7, _unsigned(0xF7, track) + _unsigned(0xF1, position))
-        self._cues.append(_element(0xBB, _unsigned(0xB3, self._cluster_us) + where))
+        where = _unsigned("CueTrack", track) + _unsigned("CueClusterPosition", position)
+        where = _element("CueTrackPositions", where)
+        self._cues.append(_element("CuePoint", _unsigned("CueTime", self._cluster_us) + where))
         self._cluster, self._cluster_us = [], None
         self._cluster_tracks = set()
 
