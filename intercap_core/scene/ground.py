@@ -14,21 +14,16 @@ from intercap_core.scene.up import UpDirection, degrees_between
 # Height above the floor of the lowest foot keypoint (heel or toe) of a standing person, measured on
 # the open body.
 FOOT_HEIGHT_M = 0.014
-# Feet whose heights differ by more do not stand on one floor. Tuned on the studio: at 0.1 m, beams
-# of 12 cm and stairs are taken for the floor.
-FOOT_TOLERANCE_M = 0.05
+# Least difference in height of two levels. Feet within half of it of a height stand on one level,
+# and a point this far under a plane is evidence against the plane as the floor. Tuned on the
+# studio: at 0.2 m, beams of 12 cm, stairs and platforms of 15 cm are taken for the floor.
+LEVEL_M = 0.10
 # Least number of sets with visible feet that form a level: the median of five tolerates two wrong
 # detections.
 MIN_FOOT_SETS = 5
 # Cosine of the largest angle of a floor point's normal to the plane's, 20 degrees. Tuned on the
 # studio.
 FLOOR_COSINE = 0.94
-# Largest distance of an inlier from a plane hypothesis that is not refined yet. Tuned on the
-# studio.
-UNREFINED_TOLERANCE_M = 0.03
-# Depth under a plane from which a point is evidence against it as the floor. Tuned on the studio:
-# at 0.2 m, platforms of 15 cm are taken for the floor.
-BELOW_FLOOR_M = 0.10
 MIN_FLOOR_AREA_M2 = 0.5  # least visible area of a floor: a square of 0.7 m; tuned on the studio
 
 
@@ -99,8 +94,8 @@ def fit_ground(
     if not len(tried):
         return NO_GROUND
     height = (sample @ normals[tried].T) - (points[tried] * normals[tried]).sum(1)
-    inside = (np.abs(height) < UNREFINED_TOLERANCE_M).sum(0)
-    below = (height < -BELOW_FLOOR_M).sum(0)
+    inside = (np.abs(height) < 2 * tolerance_m).sum(0)  # hypotheses are not refined
+    below = (height < -LEVEL_M).sum(0)
     # a point below the plane counts as much as three inliers; tuned on the studio
     best = tried[np.argmax(inside - 3.0 * below)]
     fitted = _refined(
@@ -116,24 +111,24 @@ def _lowest(
 ) -> GroundPlane:
     """The lowest large plane below and parallel to ``ground``, or ``ground`` if there is none.
 
-    Points (N, 3) with normals (N, 3) that face up. Each round looks for the densest layer, 6 cm
-    thick, at least :data:`BELOW_FLOOR_M` below the current plane, and refines a plane there.
+    Points (N, 3) with normals (N, 3) that face up. Each round looks for the densest layer, four
+    tolerances thick, at least :data:`LEVEL_M` below the current plane, and refines a plane there.
     """
     upper = ground
     while True:
         facing = normals @ ground.normal >= FLOOR_COSINE
         height = (points - ground.point) @ ground.normal
-        under = np.flatnonzero(facing & (height < -BELOW_FLOOR_M))
+        under = np.flatnonzero(facing & (height < -LEVEL_M))
         if len(under) * cell_m**2 < MIN_FLOOR_AREA_M2:
             break
         order = under[np.argsort(height[under])]
-        reach = height[order] + 2 * UNREFINED_TOLERANCE_M
+        reach = height[order] + 4 * tolerance_m
         count = np.searchsorted(height[order], reach, side="right") - np.arange(len(order))
         first = int(np.argmax(count))
         start = points[order[first : first + count[first]]].mean(0)
         lower = _refined(points, normals, start, ground.normal, tolerance_m)
         parallel = degrees_between(lower.normal, ground.normal) <= 3.0  # two level surfaces
-        deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
+        deep = (lower.point - ground.point) @ ground.normal < -LEVEL_M
         if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
             break
         if _covered(points, lower, ground, tolerance_m) > 0.5:
@@ -174,10 +169,10 @@ def _refined(
 ) -> GroundPlane:
     """Refine a plane (``point``, ``normal``) by weighted total least squares.
 
-    Eight iterations; the largest distance of points that take part (gate) narrows from 6 cm to the
-    tolerance. Weights are Tukey's biweight of the distance.
+    Eight iterations; the largest distance of points that take part (gate) narrows from four
+    tolerances to one. Weights are Tukey's biweight of the distance.
     """
-    for gate in np.geomspace(max(2 * UNREFINED_TOLERANCE_M, tolerance_m), tolerance_m, 8):
+    for gate in np.geomspace(4 * tolerance_m, tolerance_m, 8):
         distance = (points - point) @ normal
         weight = np.maximum(0, 1 - (distance / gate) ** 2) ** 2
         weight *= normals @ normal >= FLOOR_COSINE
@@ -293,7 +288,7 @@ def describe_raised_feet(feet: np.ndarray, ground: GroundPlane) -> str:
         return ""
     height = (standing - ground.point) @ ground.normal - FOOT_HEIGHT_M
     for off, side in (
-        (height > 2 * FOOT_TOLERANCE_M, "above"), (height < -2 * FOOT_TOLERANCE_M, "below"),
+        (height > LEVEL_M, "above"), (height < -LEVEL_M, "below"),
     ):  # fmt: skip
         if off.sum() >= _supporting(len(standing)):
             return _levels(off, np.abs(height), side)
@@ -316,15 +311,15 @@ def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[
     """
     height = standing @ up
     middle = np.median(height)
-    inlier = np.abs(height - middle) < FOOT_TOLERANCE_M
+    inlier = np.abs(height - middle) < LEVEL_M / 2
     need = _supporting(len(standing))
-    above, below = height > middle + FOOT_TOLERANCE_M, height < middle - FOOT_TOLERANCE_M
+    above, below = height > middle + LEVEL_M / 2, height < middle - LEVEL_M / 2
     if max(above.sum(), below.sum()) < need or sloping:
         return inlier, ""
     if below.sum() >= need:
         middle = _lowest_level(height, need)
-        inlier = np.abs(height - middle) < FOOT_TOLERANCE_M
-        above = height > middle + FOOT_TOLERANCE_M
+        inlier = np.abs(height - middle) < LEVEL_M / 2
+        above = height > middle + LEVEL_M / 2
     return inlier, _levels(above, height - middle, "above") if above.sum() >= need else ""
 
 
@@ -336,12 +331,12 @@ def _lowest_level(height: np.ndarray, need: int) -> float:
     about a single level leaves no such gap.
     """
     order, middle = np.sort(height), float(np.median(height))
-    ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
+    ends = np.searchsorted(order, order + LEVEL_M, side="right")
     first = int(np.argmax(ends - np.arange(len(order)) >= need))
     level = float(np.median(order[first : ends[first]]))
     # number of heights within 2.5 cm of places every centimetre from the level up to the median
-    between = np.arange(level, middle, 0.2 * FOOT_TOLERANCE_M)
-    near = np.abs(height[:, None] - between) < 0.5 * FOOT_TOLERANCE_M
+    between = np.arange(level, middle, LEVEL_M / 10)
+    near = np.abs(height[:, None] - between) < LEVEL_M / 4
     count = near.sum(0)
     return level if len(count) and count.min() < 0.5 * count[0] else middle
 
@@ -371,7 +366,7 @@ def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
         if normal is None or degrees_between(normal, up) > 15.0:
             return None
         distance = (standing - standing[kept].mean(0)) @ normal
-        kept = np.abs(distance - np.median(distance[kept])) < FOOT_TOLERANCE_M
+        kept = np.abs(distance - np.median(distance[kept])) < LEVEL_M / 2
         if kept.sum() < MIN_FOOT_SETS:
             return None
     return normal if (~kept).sum() < _supporting(len(standing)) else None
