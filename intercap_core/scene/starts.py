@@ -18,15 +18,13 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA
 
 # Standard deviation of the time offset of synchronised devices: of a uniform distribution over
 # +-0.017 s, half the time between frames of a Kinect.
 PRIOR_OFFSET_S = 0.01
 NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
-# Combined standard deviations beyond which keypoints overrule a stated start. At three, about one
-# correct statement in 400 would be overruled by chance.
-REJECTED_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +94,13 @@ class StatedStarts:
 
         ``step_s``: seconds per set. ``reach``: the bound for cameras without a statement.
         """
-        away = REJECTED_SIGMAS * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
+        away = OUTLIER_SIGMA * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
     def states_apart(self, step_s: float) -> bool:
         """Whether a statement contradicts the images' own times by at least two sets beyond its
         accuracy."""
-        least = 2 * step_s + REJECTED_SIGMAS * self.sigma
+        least = 2 * step_s + OUTLIER_SIGMA * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
@@ -140,7 +138,7 @@ class StatedStarts:
             if not self.known[c]:
                 late[c], sigma[c], source[c] = other.late[c], other.sigma[c], other.source[c]
                 continue
-            if abs(late[c] - other.late[c]) > REJECTED_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
+            if abs(late[c] - other.late[c]) > OUTLIER_SIGMA * np.hypot(sigma[c], other.sigma[c]):
                 odd[c] = (
                     f"{source[c]} has it start {describe_start(late[c])}, {other.source[c]} "
                     f"{describe_start(other.late[c])}: the first was taken"
