@@ -14,31 +14,29 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
+from intercap_core.body.keypoints import keypoint_pairs, of_side
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.time_series import sample_evenly
 
-# Largest distance from a bone to skin, clothing and hair, metres, in the order of LIMB_BONES. These
-# radii exceed those of the segmentation, because pixels left out here do no harm. Tuned on the
-# studio.
-LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
-# The same for trunk and head, whose bones LIMB_BONES lacks. A pair of equal names is a ball: the
-# hand around the wrist.
-TRUNK_REACH_M: dict[tuple[str, str], float] = {
+# Largest distance from a bone to skin, clothing and hair, metres: of the bones of the middle, and
+# of those of either side. A pair of equal names is a ball: the hand around the wrist. These radii
+# exceed those of the segmentation, because pixels left out here do no harm. Tuned on the studio.
+MIDDLE_REACH_M = {
     ("neck", "mid_hip"): 0.26,
-    ("right_shoulder", "right_hip"): 0.20,
-    ("left_shoulder", "left_hip"): 0.20,
     ("nose", "neck"): 0.22,
     ("left_ear", "right_ear"): 0.20,
-    ("right_wrist", "right_wrist"): 0.24,
-    ("left_wrist", "left_wrist"): 0.24,
 }
+SIDE_REACH_M = {
+    ("shoulder", "hip"): 0.20, ("wrist", "wrist"): 0.24, ("shoulder", "elbow"): 0.16,
+    ("elbow", "wrist"): 0.14, ("hip", "knee"): 0.18, ("knee", "ankle"): 0.15,
+    ("ankle", "big_toe"): 0.14, ("ankle", "heel"): 0.14,
+}  # fmt: skip
 
-_BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))
+_BONES = (*MIDDLE_REACH_M, *of_side("right", SIDE_REACH_M), *of_side("left", SIDE_REACH_M))
 _FIRST, _SECOND = keypoint_pairs(_BONES).T
-_REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
+_REACH = np.array([*MIDDLE_REACH_M.values(), *SIDE_REACH_M.values(), *SIDE_REACH_M.values()])
 
 
 def mask_person(

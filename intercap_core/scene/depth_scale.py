@@ -15,8 +15,8 @@ from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.person.sides import BODY_POINTS
 
-_UP = (2.0, 4.0, 5.0, 10.0, 100.0, 1000.0)
-FACTORS = sorted((1.0, *_UP, *(1 / factor for factor in _UP)))  # between the units above
+# Possible factors between the units above.
+FACTORS = sorted({f for k in (1.0, 2.0, 4.0, 5.0, 10.0, 100.0, 1000.0) for f in (k, 1 / k)})
 IMAGES = 20  # of each camera, which hold hundreds of body points
 MIN_POINTS = 12  # half of the body points of one image
 # Depth of the skin over that of the joint: skin is nearer by up to 0.13 m at 1.3 m, feet stand on
