@@ -19,7 +19,7 @@ from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.project import Project
-from intercap_core.schemas import METRIC_REGIONS, PERSON, SCENE
+from intercap_core.schemas import CONTACT_M, METRIC_REGIONS, PERSON, SCENE
 
 Figures = dict[str, float]
 # Keypoints that lie in a joint of the same name; those of the skin have no true joint.
@@ -167,7 +167,7 @@ def _joint(written: Sequence[Written]) -> Figures:
                         BodySurface(vertices.astype(np.float64), faces, tree),
                         track.rotation[t],
                         track.translation[t],
-                        1.01 * contact.CONTACT_M,
+                        1.01 * CONTACT_M,
                     )
                 )
                 for t, vertices in enumerate(fitted.vertices())

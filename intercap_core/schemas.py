@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from intercap_core.artefacts import Field, Schema
 
+CONTACT_M = 0.0045  # distance of contact; the paper's threshold, "Contact Heatmaps"
 CONTACT_REGIONS = (
     "left_hand", "right_hand", "left_foot", "right_foot", "left_thigh", "right_thigh", "seat",
     "back", "chest", "left_forearm", "right_forearm", "mouth", "left_shoulder", "right_shoulder",

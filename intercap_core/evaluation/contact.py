@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-CONTACT_M = 0.0045  # the paper's threshold, Experiments, "Contact Heatmaps"
+from intercap_core.schemas import CONTACT_M
+
 # Thresholds, metres, at which agreement with the true contact is also evaluated.
 SWEEP_M = (0.002, 0.003, 0.0045, 0.006, 0.008, 0.010, 0.015, 0.020, 0.030)
 

@@ -18,7 +18,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation import contact, object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.schemas import BAD_BODY_M, METRICS, PER_VERTEX_METRICS
+from intercap_core.schemas import BAD_BODY_M, CONTACT_M, METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
 
 SUMMARY_TRUTH = (
@@ -274,7 +274,7 @@ def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figure
     found, true, counts, touching, truly = (
         np.concatenate([s.values[name] for s in have if name in s.values]) for name in names
     )
-    at = list(contact.SWEEP_M).index(contact.CONTACT_M)
+    at = list(contact.SWEEP_M).index(CONTACT_M)
     return {
         "contact_region_f1": contact.f1(contact.confusion(found.ravel(), true.ravel())),
         "contact_f1": contact.f1(counts[:, at].sum(0)),

@@ -31,7 +31,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface, vertex_normals
 from intercap_core.progress import Progress
-from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
 
@@ -178,7 +178,7 @@ class Measurement:
         to_body = surface.signed_distance(object_vertices)
         # outside the body only contact is evaluated, so distances may be clipped beyond the
         # thresholds
-        reach = 1.01 * max(self.threshold, contact.CONTACT_M)
+        reach = 1.01 * max(self.threshold, CONTACT_M)
         point_distance = surface.signed_distance(points, reach=reach)
         track = handled.track
         to_object = handled.surface.signed_distance(

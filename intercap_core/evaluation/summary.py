@@ -14,10 +14,10 @@ import numpy as np
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
-from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement
-from intercap_core.schemas import JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
+from intercap_core.schemas import CONTACT_M, JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
 from intercap_core.sequence_inputs import SequencePaths
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import trimesh
 
 from intercap_core import artefacts
-from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.geometry.rigid.distance import DistanceField, build_scene, o3d
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
-from intercap_core.schemas import METRICS
+from intercap_core.schemas import CONTACT_M, METRICS
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 # Mean thickness (twice the volume by the area) below which an object is thin-walled, metres: a body

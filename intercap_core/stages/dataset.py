@@ -19,7 +19,6 @@ from intercap_core.config import BodyModels, CardSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
-from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.summary import Heatmaps, SequenceSummary, collect_heatmaps
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.release.card import facts, markdown, split_table
@@ -27,7 +26,7 @@ from intercap_core.output.release.croissant import croissant
 from intercap_core.output.site import overview, tables
 from intercap_core.output.site.heat_pictures import body_surfaces, highest, object_pictures
 from intercap_core.output.site.overview import DatasetContent, Heat
-from intercap_core.schemas import HEATMAPS
+from intercap_core.schemas import CONTACT_M, HEATMAPS
 
 log = logging.getLogger(__name__)
 

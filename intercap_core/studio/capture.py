@@ -24,7 +24,7 @@ from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress
-from intercap_core.schemas import CONTACT_REGIONS, TRUTH
+from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS, TRUTH
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import MaskSimulator
@@ -34,8 +34,6 @@ from intercap_core.studio.render import scene_of
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.skeleton import turn, unit
 from intercap_core.studio.stage import StageState, StudioStage
-
-CONTACT_M = 0.0045  # skin this near to the object touches it
 
 
 def write_truth(

@@ -11,10 +11,10 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.annotation import ContactInterval
 from intercap_core.errors import UserError
-from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.motion import Motion
-from intercap_core.schemas import JOINT, METRICS
+from intercap_core.schemas import CONTACT_M, JOINT, METRICS
 
 _DRAFT_HEADER = """\
 # Draft of the contact of {sequence}, as the joint stage states it: correct it, and copy it to

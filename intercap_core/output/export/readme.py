@@ -8,12 +8,12 @@ from pathlib import Path
 import jinja2
 
 from intercap_core.body.maps import maps_path
-from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.verdict.figures import StatedError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import DEVIATIONS_SOURCE, About
 from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.motion import Coordinates, Motion
+from intercap_core.schemas import CONTACT_M
 
 NEED_OBJECT = ("bop", "contact")  # formats that describe an object only
 

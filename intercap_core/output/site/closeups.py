@@ -18,7 +18,7 @@ from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.evaluation import flags
-from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
@@ -36,7 +36,7 @@ from intercap_core.output.site.drawing import (
     put_text,
 )
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
-from intercap_core.schemas import JOINT, SCENE
+from intercap_core.schemas import CONTACT_M, JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SIDES = ("left", "right")

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
+from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.through_wall import behind_wall
 from intercap_core.geometry.rigid.facing import facing_distance
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
+from intercap_core.schemas import CONTACT_M
 
 FINGER_M, INNER_M, OUTER_M, HEIGHT_M = 0.008, 0.036, 0.039, 0.09  # radii and height
 
