@@ -21,12 +21,13 @@ import numba
 import numpy as np
 
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import NUM_POSE
+from intercap_core.body.parameters import NUM_POSE, POSE_COLUMNS
 from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import _rodrigues, rest_points
 
 NUM_FEATURES = 486  # nine numbers of each of the 54 rotations below the root (SMPL-X)
-_FIRST = 3  # column of the first joint below the root in the parameter vector (SMPL-X)
+# Column of the first joint below the root in the parameter vector.
+_FIRST = POSE_COLUMNS["body_pose"].start
 
 # Number of points that are processed for all bodies in turn: their tables, 6 kB each, then stay in
 # the cache of a core.

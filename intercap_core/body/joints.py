@@ -22,6 +22,18 @@ NUM_JOINTS = len(JOINT_NAMES)
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 FIRST_FINGER = JOINT_INDEX["left_index1"]
 """The joints from here on are those of the fingers, three of each."""
+BODY_JOINTS = slice(JOINT_INDEX["pelvis"], JOINT_INDEX["jaw"])
+"""The 22 joints of trunk and limbs, wrists included."""
+BOTH_HANDS = slice(FIRST_FINGER, NUM_JOINTS)
+FINGER_JOINTS = (
+    slice(FIRST_FINGER, JOINT_INDEX["right_index1"]),
+    slice(JOINT_INDEX["right_index1"], NUM_JOINTS),
+)
+"""Joints of the left and of the right hand, without the wrists."""
+FOOT_JOINTS = [
+    JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
+]
+"""Ankle and ball of either foot."""
 
 
 def ancestors(joint: int) -> tuple[int, ...]:

@@ -44,15 +44,19 @@ def _hand(side: str) -> list[tuple[str, str]]:
 
 
 _POINTS = (*_BODY, *_hand("left"), *_hand("right"))
-KEYPOINT_NAMES: tuple[str, ...] = (
-    *(name for name, _ in _POINTS),
-    *(f"face_{i}" for i in range(17, 68)),
-    *(f"face_{i}" for i in range(17)),
+_GROUPS = (
+    [name for name, _ in _BODY],
+    [name for name, _ in _hand("left")],
+    [name for name, _ in _hand("right")],
+    [f"face_{i}" for i in range(17, 68)],
+    [f"face_{i}" for i in range(17)],
 )
+KEYPOINT_NAMES: tuple[str, ...] = tuple(name for group in _GROUPS for name in group)
 NUM_KEYPOINTS = len(KEYPOINT_NAMES)
 KEYPOINT_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
-BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)  # order of OpenPose
-FACE, CONTOUR = slice(67, 118), slice(118, 135)  # order of SMPL-X's landmarks
+BODY, LEFT_HAND, RIGHT_HAND, FACE, CONTOUR = (
+    slice(KEYPOINT_INDEX[group[0]], KEYPOINT_INDEX[group[-1]] + 1) for group in _GROUPS
+)
 
 
 def _partner(name: str) -> str:

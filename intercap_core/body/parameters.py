@@ -23,7 +23,7 @@ POSE_COLUMNS = {
 }
 """Columns of each block in the parameter vector."""
 HAND_COLUMNS = (POSE_COLUMNS["left_hand_pose"], POSE_COLUMNS["right_hand_pose"])
-NUM_POSE = 165  # axis-angles of the 55 joints (SMPL-X)
+NUM_POSE = sum(size for _, size in POSE_BLOCKS)
 TRANSL = slice(NUM_POSE, NUM_POSE + 3)
 
 

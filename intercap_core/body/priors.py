@@ -33,12 +33,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from intercap_core.body.joints import JOINT_NAMES
+from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.body.parameters import HAND_COLUMNS, NUM_POSE
 
-# Elbows (y) and knees (x), left and right: column in the parameter vector, sign of the unnatural
-# direction (Bogo et al. 2016, SMPLify).
-BENDING: tuple[tuple[int, int], ...] = ((55, 1), (58, -1), (12, -1), (15, -1))
+# Elbows (y) and knees (x): column in the parameter vector, sign of the unnatural direction (Bogo et
+# al. 2016, SMPLify).
+BENDING = (
+    (3 * JOINT_INDEX["left_elbow"] + 1, 1),
+    (3 * JOINT_INDEX["right_elbow"] + 1, -1),
+    (3 * JOINT_INDEX["left_knee"], -1),
+    (3 * JOINT_INDEX["right_knee"], -1),
+)
 
 _Range = tuple[float, float]
 _FREE: _Range = (-180.0, 180.0)

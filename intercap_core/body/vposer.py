@@ -25,11 +25,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from intercap_core.body.checkpoint import read_tensors, tensor_fault
+from intercap_core.body.parameters import POSE_BLOCKS
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import UnreadableFile
 
 LATENT = 32  # length of a code (Pavlakos et al. 2019)
-_JOINTS = 21  # of SMPL-X's body_pose
 # Version: names of the three layers, slope of the leaky ReLU (published code).
 _VERSIONS = {
     1: (("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"), 0.2),
@@ -111,7 +111,7 @@ class VPoser:
         x = code
         for weight, bias in self.layers[:-1]:
             x = functional.leaky_relu(functional.linear(x, weight, bias), self.slope)
-        x = functional.linear(x, *self.layers[-1]).reshape(*code.shape[:-1], _JOINTS, 3, 2)
+        x = functional.linear(x, *self.layers[-1]).reshape(*code.shape[:-1], -1, 3, 2)
         first = functional.normalize(x[..., 0], dim=-1)
         second = x[..., 1] - (first * x[..., 1]).sum(-1, keepdim=True) * first
         second = functional.normalize(second, dim=-1)
@@ -194,8 +194,8 @@ def _check(path: Path, weights: dict[str, Tensor], layers: list[tuple[str, str]]
     """Raise UserError if the weights and biases cannot be those of a decoder."""
     first = weights[layers[0][0]]
     hidden = min(max(len(first) if first.ndim else 0, 1), 4096)  # the published files have 512
-    # the last layer outputs two columns of each rotation, 6 numbers
-    sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
+    # the last layer outputs two columns of each rotation
+    sizes = ((hidden, LATENT), (hidden, hidden), (2 * dict(POSE_BLOCKS)["body_pose"], hidden))
     for (weight, bias), size in zip(layers, sizes, strict=True):
         for name, shape in ((weight, size), (bias, size[:1])):
             # weights of the published files are below 10

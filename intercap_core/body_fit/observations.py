@@ -11,7 +11,7 @@ from torch import Tensor
 
 from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
-from intercap_core.body.keypoints import BODY
+from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX
 from intercap_core.body_fit.free_space import DepthWindow
 from intercap_core.body_fit.outlines import MaskRim, trace_outline
 from intercap_core.errors import UserError
@@ -24,8 +24,11 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.schemas import PERSON, SCENE
 
-# neck, shoulders, mid hip and hips in OpenPose's order: keypoints that place the trunk
-TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
+# Keypoints that place the trunk.
+TRUNK_KEYPOINTS = [
+    KEYPOINT_INDEX[name]
+    for name in ("neck", "right_shoulder", "left_shoulder", "mid_hip", "right_hip", "left_hip")
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class Observations:
     @property
     def placed(self) -> np.ndarray:
         """(T,) bool: three keypoints of the trunk are triangulated, enough to place a body."""
-        trunk = self.joints[:, list(TRUNK_KEYPOINTS)]
+        trunk = self.joints[:, TRUNK_KEYPOINTS]
         return np.isfinite(trunk).all(2).sum(1) >= 3
 
     @property

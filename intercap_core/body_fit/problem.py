@@ -20,13 +20,13 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body_fit.definition import Definition
+from intercap_core.body_fit.definition import POINTS, Definition
 from intercap_core.body_fit.surface import COVERINGS, Samples
 from intercap_core.body_fit.term_inputs import Bodies, Columns, TermInputs
 from intercap_core.body_fit.terms import CompiledTerms
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
-NUM_OFFSETS = 25  # OpenPose's body keypoints
+NUM_OFFSETS = len(POINTS)
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:

@@ -15,12 +15,12 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.body.keypoints import CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
 from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
-from intercap_core.schemas import BODY_PARTS
+from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
+from intercap_core.schemas import BAD_BODY_M, BODY_PARTS
 
-# Standard deviation along one coordinate beyond which a part is undetermined, metres. At this
-# value half of its joints have errors above 40 mm: the median length of a normal error in three
-# dimensions is 1.54 standard deviations.
-LARGEST_SIGMA_M = 0.026
+# Standard deviation along one coordinate beyond which a part is undetermined, metres: half of its
+# joints then have errors above that of a bad body.
+LARGEST_SIGMA_M = BAD_BODY_M / MEDIAN_CHI_3
 # The same for hands: half of the joints have errors above 20 mm, the distance between fingers
 # (anatomy).
 LARGEST_HAND_SIGMA_M = 0.013

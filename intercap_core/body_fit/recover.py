@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.joints import BODY_JOINTS
 from intercap_core.body_fit.bridge import bridge
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.solve.levenberg_marquardt import minimise
@@ -22,8 +22,6 @@ FIT_SCATTER_M = 0.1  # fits of a still body scatter by less, metres; measured on
 # Distance from the median of the window beyond which a joint jumps, metres. Hands accelerate by up
 # to 30 m/s^2 (anatomy): within 0.1 s they leave a straight path by 30 / 2 * 0.1^2 = 0.15 m.
 JUMP_M = FIT_SCATTER_M + 0.15
-
-_BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 
 
 def measure_jumps(
@@ -66,7 +64,7 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     model = problem.model
     improved = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
-    joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
+    joints = model.forward(params, vertex_ids=np.array([0])).joints[:, BODY_JOINTS]
     jumps = measure_jumps(joints.double().numpy(), times, FIT_SCATTER_M)
     jumped = np.asarray((jumps > 0).any(1))
     if not jumped.any() or jumped.all():

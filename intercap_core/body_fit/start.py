@@ -31,13 +31,12 @@ def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.
     Returns:
         (T, 6) rotation vectors and translations, NaN if fewer than three trunk keypoints are known.
     """
-    trunk = list(TRUNK_KEYPOINTS)
     result = np.full((len(joints), 6), np.nan)
-    for t, frame in enumerate(joints[:, trunk]):
+    for t, frame in enumerate(joints[:, TRUNK_KEYPOINTS]):
         known = np.isfinite(frame).all(1)
         if known.sum() < 3:
             continue
-        source, target = rest[trunk][known] - pelvis, frame[known]
+        source, target = rest[TRUNK_KEYPOINTS][known] - pelvis, frame[known]
         centre_s, centre_t = source.mean(0), target.mean(0)
         u, _, vt = np.linalg.svd((target - centre_t).T @ (source - centre_s))
         flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -1,20 +1,12 @@
-"""Errors of a fitted body against the true body, metres.
-
-Joints are the 55 of SMPL-X: 0-21 body, 22-24 jaw and eyes, 25-39 left and 40-54 right fingers.
-"""
+"""Errors of a fitted body against the true body, metres; joints are the 55 of SMPL-X."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS, JOINT_INDEX
 from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
-
-# Indices of SMPL-X's joints
-BODY_JOINTS = slice(0, 22)
-FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
-FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
-BOTH_HANDS = slice(25, 55)
 
 
 def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:
@@ -85,7 +77,8 @@ def hand_error(
         align_wrists: first translate the fitted hand so that its wrist is at the true wrist.
     """
     errors = []
-    for side, wrist in enumerate((20, 21)):  # SMPL-X joints of the left and right wrist
+    for side, name in enumerate(("left", "right")):
+        wrist = JOINT_INDEX[f"{name}_wrist"]
         at = slice(5 * side, 5 * side + 5)
         fitted = np.concatenate([joints[..., FINGER_JOINTS[side], :], tips[..., at, :]], -2)
         true = np.concatenate([true_joints[..., FINGER_JOINTS[side], :], true_tips[..., at, :]], -2)

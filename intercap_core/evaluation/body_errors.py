@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.body.joints import JOINT_NAMES
+from intercap_core.body.joints import BODY_JOINTS, BOTH_HANDS, JOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels
 from intercap_core.evaluation import body, contact
@@ -103,7 +103,7 @@ class BodyClouds:
         return anyhow & seen_by_cameras(points, normals, cameras, occluders)
 
 
-BODY_JOINT_NAMES = JOINT_NAMES[body.BODY_JOINTS]
+BODY_JOINT_NAMES = JOINT_NAMES[BODY_JOINTS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ def measure(
         acceleration=found_errors["acceleration_body"],
         normalised=found_errors["joint_normalised"],
         normalised_hands=body.normalised_joint_error(
-            track.joints, known.joints, track.sigma, body.BOTH_HANDS
+            track.joints, known.joints, track.sigma, BOTH_HANDS
         ),
         flagged=track.flagged,
         clouds=clouds,

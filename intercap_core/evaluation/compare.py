@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
+from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.errors import UserError
-from intercap_core.evaluation.body import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.schemas import JOINT

@@ -13,21 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.joints import FOOT_JOINTS, JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.evaluation.body import FOOT_JOINTS
 from intercap_core.evaluation.faulty_rigs import NamedFault
 from intercap_core.evaluation.motion import Floor
-from intercap_core.evaluation.scene_errors import (
-    CUBE_SIDE_M,
-    MEDIAN_CHI_1,
-    displacement,
-    rig_centre,
-)
+from intercap_core.evaluation.scene_errors import CUBE_SIDE_M, displacement, rig_centre
 from intercap_core.evaluation.start_windows import WindowErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.scene.starts import NOT_DETERMINED
 from intercap_core.schemas import FRAMES, PERSON, SCENE, TRUTH
 
@@ -198,7 +193,7 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     known = solved & (sigma > 0)
     if known.any():
         found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
-        found["offset_normalised"] = float(np.median(late[known] / sigma[known])) / MEDIAN_CHI_1
+        found["offset_normalised"] = SIGMA_PER_MAD * float(np.median(late[known] / sigma[known]))
     return found
 
 

@@ -48,7 +48,7 @@ def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredClo
 
 
 REACH_M = 0.10  # distances outside a surface are clipped here: no figure needs larger ones
-DEEPEST_M = 0.25  # depths inside a surface are clipped here
+DEEPEST_M = 0.25  # depths inside a surface, and distances of measured points, are clipped here
 
 
 class PosedObject:

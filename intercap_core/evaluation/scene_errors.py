@@ -12,6 +12,7 @@ from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.schemas import FRAMES, SCENE, TRUTH
 
 # Side of the cube over which displacements are averaged (docs/evaluation.md).
@@ -54,7 +55,6 @@ def displacement(
 
 # Radius of the capture area on the floor around the rig's centre (docs/evaluation.md).
 CAPTURE_RADIUS_M = 1.5
-MEDIAN_CHI_1 = 0.6745  # median of |x| for a standard normal x
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
         found["offset_error_worst_ms"] = 1e3 * float(np.abs(offset).max())
     normalised = _joined([c.offset_normalised for c in captures])
     if np.isfinite(normalised).any():
-        ratio = float(np.nanmedian(np.abs(normalised))) / MEDIAN_CHI_1
+        ratio = SIGMA_PER_MAD * float(np.nanmedian(np.abs(normalised)))
         found["offset_normalised_median"] = ratio
     if len(offset):
         found["offset_estimated_share"] = float(np.isfinite(normalised).mean())

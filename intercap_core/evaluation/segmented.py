@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.evaluation.proximity import DEEPEST_M
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
@@ -19,10 +20,6 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 from intercap_core.sequence_inputs import SequencePaths
 
-# Only depth pixels within this distance of the meshes are used. Larger distances would not change
-# the judgement of a fit.
-MARGIN_M = 0.25
-
 
 def segmented_points(
     depth: np.ndarray, camera: Camera, masks: Sequence[Runs | None], near: np.ndarray, bias_m: float
@@ -30,7 +27,7 @@ def segmented_points(
     """Points (N, 3) float32 of each mask, master frame, metres.
 
     A depth point belongs to a mask if the mask covers its projection into the colour image. Only
-    depth pixels are used that lie within :data:`MARGIN_M` of the box, in image and depth, of the
+    depth pixels are used that lie within :data:`DEEPEST_M` of the box, in image and depth, of the
     points ``near``.
 
     Args:
@@ -48,7 +45,7 @@ def segmented_points(
     )
     if not np.isfinite(least[2]):  # the camera sees none of the points
         return points
-    margin = lens.fx * MARGIN_M / max(float(least[2]), MARGIN_M)
+    margin = lens.fx * DEEPEST_M / max(float(least[2]), DEEPEST_M)
     low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
     for place, runs in enumerate(masks):
         window = None if runs is None else mask_window(depth, camera, runs)
@@ -60,8 +57,8 @@ def segmented_points(
             lens.rays,
             (int(low[0]), int(low[1])),
             (int(high[0]), int(high[1])),
-            1e3 * max(float(least[2]) - MARGIN_M, 0.0),
-            1e3 * (float(most[2]) + MARGIN_M),
+            1e3 * max(float(least[2]) - DEEPEST_M, 0.0),
+            1e3 * (float(most[2]) + DEEPEST_M),
             camera.master_from_depth.astype(np.float32),
             np.float32(bias_m),
         )

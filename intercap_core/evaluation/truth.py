@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
+from intercap_core.body.joints import BODY_JOINTS, BOTH_HANDS, FOOT_JOINTS
 from intercap_core.errors import UserError
 from intercap_core.evaluation import body, contact, motion, object_pose
 from intercap_core.evaluation.motion import Floor
@@ -171,19 +172,20 @@ def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndar
     """
     joints, tips = track.joints, track.tips
     true = truth.joints
-    hands = np.r_[body.FINGER_JOINTS[0], body.FINGER_JOINTS[1]]
     result = {
         "body_mpjpe": body.joint_error(joints, true),
         "hand_mpjpe": body.hand_error(joints, tips, true, truth.tips),
         "hand_mpjpe_wrist": body.hand_error(joints, tips, true, truth.tips, align_wrists=True),
         "acceleration_body": motion.acceleration_error(
-            joints[:, body.BODY_JOINTS], true[:, body.BODY_JOINTS], fps
+            joints[:, BODY_JOINTS], true[:, BODY_JOINTS], fps
         ),
-        "acceleration_hands": motion.acceleration_error(joints[:, hands], true[:, hands], fps),
+        "acceleration_hands": motion.acceleration_error(
+            joints[:, BOTH_HANDS], true[:, BOTH_HANDS], fps
+        ),
         "acceleration_feet": motion.acceleration_error(
-            joints[:, body.FOOT_JOINTS], true[:, body.FOOT_JOINTS], fps
+            joints[:, FOOT_JOINTS], true[:, FOOT_JOINTS], fps
         ),
-        "joint_offset": (joints - true)[:, body.BODY_JOINTS],
+        "joint_offset": (joints - true)[:, BODY_JOINTS],
         "fingertips": np.linalg.norm(tips - truth.tips, axis=-1).reshape(-1, 2, 5).mean(-1),
     }
     if track.sigma is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
-from intercap_core.body.joints import JOINT_INDEX, PARENTS
+from intercap_core.body.joints import BODY_JOINTS, JOINT_INDEX, PARENTS
 from intercap_core.body.parameters import HAND_COLUMNS
 from intercap_core.body_fit.quality import LARGEST_HAND_SIGMA_M
 from intercap_core.joint.state import State
@@ -171,7 +171,7 @@ def _variances(diagonal: np.ndarray, off_diagonal: np.ndarray) -> np.ndarray:
 
 def _world_rotations(body: np.ndarray) -> np.ndarray:
     """Rotations (T, 22, 3, 3) of pelvis, trunk and limbs in the master frame, of poses (T, 168)."""
-    count = 22
+    count = BODY_JOINTS.stop
     local = Rotation.from_rotvec(body[:, : 3 * count].reshape(-1, 3)).as_matrix()
     world = local.reshape(-1, count, 3, 3).copy()
     for k in range(1, count):

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.body.joints import BODY_JOINTS
 from intercap_core.config import MetricsSettings, digest
-from intercap_core.evaluation import body, motion, object_pose
+from intercap_core.evaluation import motion, object_pose
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.flags import exchanged, merge_reasons
 from intercap_core.evaluation.measurement import HandledObject, Measurement, Values
@@ -122,7 +123,7 @@ def run(
 
 def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) -> Values:
     """Accelerations (T,) of the body's joints and of the object, metres per frame^2 at 30 fps."""
-    joints = body_track.joints[:, body.BODY_JOINTS]
+    joints = body_track.joints[:, BODY_JOINTS]
     values: Values = {"acceleration_body": motion.acceleration(joints, fps)}
     if handled is not None:
         track, point = handled.track, handled.mesh.centre_of_mass

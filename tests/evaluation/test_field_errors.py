@@ -19,6 +19,7 @@ from intercap_core.evaluation.field_errors import (
 from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 
 
 def _scene(fps: float, late_ms: list[float], **values: object) -> FieldScene:
@@ -46,8 +47,7 @@ def test_cameras_are_solved_within_half_a_set_or_named() -> None:
     assert found["offset_error_ms"] == pytest.approx(3.0)
     assert found["offset_error_worst_ms"] == pytest.approx(4.0)
     assert found["offset_sigma_ms"] == pytest.approx(2.0)
-    # a normal deviate is above 0.6745 deviations in half of the cases
-    assert found["offset_normalised"] == pytest.approx(1.5 / 0.6745)
+    assert found["offset_normalised"] == pytest.approx(1.5 * SIGMA_PER_MAD)
 
 
 def test_cameras_made_worse_are_counted() -> None:

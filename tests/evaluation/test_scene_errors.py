@@ -11,6 +11,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation import scene_errors
 from intercap_core.evaluation.scene_errors import CaptureErrors, Slip, SlipCounts
 from intercap_core.evaluation.truth import match_times
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from tests.helpers import fitted_capture as fitted
 
 UP = np.array([0, 0, 1.0])
@@ -73,7 +74,7 @@ def _errors(room: str = "furnished", **values: object) -> CaptureErrors:
     three = np.array([0.010, 0.020, 0.030])
     known = {
         "before": three, "after": three / 10, "offset": np.array([0.001, -0.003, 0.002]),
-        "offset_normalised": np.array([0.6745, -0.6745, np.nan]),
+        "offset_normalised": np.array([1, -1, np.nan]) / SIGMA_PER_MAD,
         "slips": SlipCounts(found=2, missed=0, false=0, images_wrong=1, images=100),
         "ground_m": 0.002, "ground_deg": 0.1, "depth_bias": np.array([0.001, -0.001, np.nan]),
     }  # fmt: skip

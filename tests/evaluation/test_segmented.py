@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.segmented import MARGIN_M, _extent, segmented_points
+from intercap_core.evaluation.proximity import DEEPEST_M
+from intercap_core.evaluation.segmented import _extent, segmented_points
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 from intercap_core.geometry.camera.masks import Runs, encode
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -47,12 +48,12 @@ def test_points_are_those_of_the_plain_lookup_around_the_meshes(bias: float):
 
     local = apply(camera.depth_from_master, NEAR)
     pixels = lens.project(local)
-    margin = lens.fx * MARGIN_M / local[:, 2].min()
+    margin = lens.fx * DEEPEST_M / local[:, 2].min()
     low, high = np.floor(pixels.min(0) - margin), np.ceil(pixels.max(0) + margin)
     row, column = np.mgrid[: lens.height, : lens.width]
     around = (column >= low[0]) & (column <= high[0]) & (row >= low[1]) & (row <= high[1])
-    around &= (depth > 1e3 * (local[:, 2].min() - MARGIN_M)) & (
-        depth < 1e3 * (local[:, 2].max() + MARGIN_M)
+    around &= (depth > 1e3 * (local[:, 2].min() - DEEPEST_M)) & (
+        depth < 1e3 * (local[:, 2].max() + DEEPEST_M)
     )
     lookup = colour_lookup(depth, camera)
     shown = lookup.shown & around.ravel()[lookup.depth_index]

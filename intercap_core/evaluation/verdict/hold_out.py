@@ -24,8 +24,8 @@ from enum import StrEnum
 import numpy as np
 import torch
 
+from intercap_core.body.joints import BOTH_HANDS
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.body import BOTH_HANDS
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs

@@ -11,8 +11,7 @@ import logging
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.evaluation.body import BOTH_HANDS
+from intercap_core.body.joints import BOTH_HANDS, JOINT_INDEX
 from intercap_core.evaluation.verdict.hold_out import JudgedPart, JudgedPoints, hold_out
 from intercap_core.evaluation.verdict.stated import FEATURES, estimate_error
 from intercap_core.joint.inputs import open_inputs

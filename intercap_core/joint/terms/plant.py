@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.joints import FOOT_JOINTS
 from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.skin import Patches
@@ -19,9 +19,6 @@ from intercap_core.joint.state import BODY, State
 from intercap_core.joint.terms.term import CREEP, SLIP_OUTLIER, Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
-_SOLES = tuple(
-    JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
-)
 # A swinging sole comes to stand 0.18 times per second, and stands for 0.98 s. Tuned on the studio.
 _STANDING = DwellChain(begins=0.18, durations=(0.98,), shares=(1.0,))
 
@@ -33,7 +30,7 @@ def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
     """
     feet = [CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right")]
     parts = []
-    for joint in _SOLES:
+    for joint in FOOT_JOINTS:
         members = np.flatnonzero(np.isin(patches.region, feet) & (patches.joint == joint))
         if len(members):
             chosen = np.linspace(0, len(members) - 1, min(len(members), count)).round().astype(int)

@@ -11,10 +11,9 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, read_parameters
-from intercap_core.body.joints import JOINT_NAMES
+from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS, JOINT_NAMES
 from intercap_core.body.keypoints import BODY, FEET, SKELETON, keypoint_pairs
 from intercap_core.errors import UserError
-from intercap_core.evaluation.body import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
