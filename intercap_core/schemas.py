@@ -338,7 +338,7 @@ JOINT = Schema(
         "body_model": "digest of the body file",
         "iterations": "accepted Gauss-Newton steps",
         "refused": "rejected steps, which would not have decreased the energy",
-        "converged": "the last steps changed little, including contact, time offsets and cameras",
+        "converged": "the last steps changed little, including contact and cameras",
         "cameras_corrected": "the cameras were refined; otherwise they are those of the scene",
     },
     optional_attributes={
@@ -356,10 +356,8 @@ JOINT = Schema(
         "contact_annotated": Field(
             ("T", "R"), "int8", "annotation: 1 contact, 0 no contact, -1 not annotated"
         ),
-        "time_offset": Field(
-            ("C",), "float64", "refined exposure time of each camera minus the set's time", "s"
-        ),
-        "time_offset_sigma": Field(("C",), "float64", "standard deviation of time_offset", "s"),
+        "time_offset": Field(("C",), "float64", "that of the scene", "s"),
+        "time_offset_sigma": Field(("C",), "float64", "that of the scene", "s"),
         "camera_names": Field(("C",), "str", "camera names"),
         "master_from_colour": Field(
             ("C", "4", "4"),

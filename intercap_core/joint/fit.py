@@ -1,7 +1,7 @@
 """The joint fit: rounds of minimising equation 6 (:mod:`.problem`) over all frames at once.
 
-Each round starts with new contact probabilities, time offsets and correspondences, and with
-corrected cameras if the setting ``refine_cameras`` is on.
+Each round starts with new contact probabilities and correspondences, and with corrected cameras
+if the setting ``refine_cameras`` is on.
 """
 
 from __future__ import annotations
@@ -139,7 +139,6 @@ def fit(
     return JointFit(
         state=state,
         contact=rounds.estimate,
-        time_offsets=body.estimate_offsets(inputs.prior),
         residuals=body.residuals(),
         energy_before=rounds.energy_before,
         energy_after=rounds.energy_after,
@@ -167,7 +166,7 @@ class _Rounds:
         assembly: Assembly,
         contact_at: Callable[[State], ContactEstimate],
     ) -> None:
-        self._assembly, self._contact_at, self._prior = assembly, contact_at, inputs.prior
+        self._assembly, self._contact_at = assembly, contact_at
         self._geometry = inputs.geometry
         self.state = inputs.sequential.state
         self.estimate = contact_at(self.state)
@@ -176,7 +175,7 @@ class _Rounds:
         self.energy_before: dict[str, float] = {}
         self.energy_after: dict[str, float] = {}
         self.last_step_m = self.last_decrease = 0.0
-        self._unchanged = False  # the last round hardly changed state, contact and time offsets
+        self._unchanged = False  # the last round hardly changed state and contact
         self._camera_shift = 0.0  # of the last correction, metres
 
     @property
@@ -189,14 +188,11 @@ class _Rounds:
         return Convergence.ITERATION_LIMIT
 
     def minimise(self, max_steps: int) -> None:
-        """Update time offsets and correspondences, minimise, and estimate contact again."""
-        assembly, body = self._assembly, self._assembly.body
+        """Update correspondences, minimise, and estimate contact again."""
+        assembly = self._assembly
         if assembly.contact is not None:
             assembly.contact.take_contact(self.estimate.probability, self.estimate.labels)
-        body.refresh(self.state)
-        offset_change = body.take_offsets(body.estimate_offsets(self._prior).offset)
-        assembly.object_.take_offsets(body.time_offset)
-        assembly.problem.refresh(self.state, but=body)
+        assembly.problem.refresh(self.state)
         minimum = minimise(assembly.problem.equations, self.state, max_steps=max_steps)
         self.state = minimum.state
         self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
@@ -210,8 +206,7 @@ class _Rounds:
         del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._contact_at(self.state)
         contact_change = self.estimate.change(previous)
-        # 1 ms is 3 mm of a hand at 3 m/s; the change of a probability is tuned on the studio
-        self._unchanged = bool(converged and contact_change < 0.1 and offset_change < 0.001)
+        self._unchanged = bool(converged and contact_change < 0.1)  # tuned on the studio
 
     def correct_cameras(self, cameras: CameraFit) -> None:
         """Correct ``cameras`` by the residuals of the body and of images of the object."""

@@ -30,7 +30,6 @@ from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_images import ObjectImages
-from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
@@ -45,7 +44,8 @@ class JointInputs:
     body_data: BodyData  # E_B over keypoints and clouds
     images: ObjectImages | None  # None without an object or without ``look_again``
     floor: FloorPlane | None  # The scene's floor, if it has one
-    prior: OffsetPrior  # The scene's time offsets
+    time_offset: np.ndarray  # (C,) the scene's time offsets, seconds
+    time_offset_sigma: np.ndarray  # (C,) standard deviations, seconds; NaN if not estimated
     cameras: CameraFit  # The scene's cameras and their covariance
     encoder: MotionEncoder | None  # LEMO's motion encoder, if the settings name its weights
     fps: float  # Frames per second
@@ -96,8 +96,7 @@ def open_inputs(
         floor = None
         if scene.attributes["ground_found"]:
             floor = FloorPlane(scene["ground_point"], scene["ground_normal"])
-        master = scene.text("camera_names").index(str(scene.attributes["master"]))
-        prior = OffsetPrior(scene["time_offset"], scene["time_offset_sigma"], master)
+        time_offset, time_offset_sigma = scene["time_offset"], scene["time_offset_sigma"]
         cameras = read_cameras(scene)
     if sequential.tracked is None:
         mesh = None
@@ -121,7 +120,8 @@ def open_inputs(
             body_data=body_data,
             images=images,
             floor=floor,
-            prior=prior,
+            time_offset=time_offset,
+            time_offset_sigma=time_offset_sigma,
             cameras=cameras,
             encoder=encoder,
             fps=fps,

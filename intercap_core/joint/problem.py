@@ -71,11 +71,10 @@ class JointProblem:
             term.add(state, equations)
         return equations
 
-    def refresh(self, state: State, but: JointTerm | None = None) -> None:
-        """Compute at ``state`` what all terms except ``but`` keep fixed during a round."""
+    def refresh(self, state: State) -> None:
+        """Compute at ``state`` the quantities that the terms keep fixed during a round."""
         for term in self.terms:
-            if term is not but:
-                term.refresh(state)
+            term.refresh(state)
 
 
 def equation_table() -> list[str]:

@@ -16,7 +16,6 @@ from intercap_core.joint.contact_estimate import ContactEstimate
 from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyResiduals
-from intercap_core.joint.time_offsets import OffsetEstimate
 from intercap_core.schemas import JOINT
 
 # Reasons of a flag that later stages search for.
@@ -32,7 +31,7 @@ class Convergence(Enum):
     CONVERGED = "converged"
     """Another round would change nothing."""
     ITERATION_LIMIT = "reached the iteration limit before converging"
-    """The last round still changed state, contact, time offsets or cameras."""
+    """The last round still changed state, contact or cameras."""
     STALLED = "stalled"
     """No step lowered the energy: every frame is flagged."""
 
@@ -43,7 +42,6 @@ class JointFit:
 
     state: State  # Refined body and object
     contact: ContactEstimate  # Contact at this state
-    time_offsets: OffsetEstimate  # Time offsets of the cameras
     residuals: BodyResiduals  # Distances of the body to the images
     energy_before: dict[str, float]  # Energy by term at the start
     energy_after: dict[str, float]  # Energy by term at this state
@@ -64,7 +62,6 @@ class JointResult:
     probability: np.ndarray  # (T, R) probability of contact
     annotated: np.ndarray  # (T, R) annotation: 1 touching, 0 free, -1 no label
     cameras: Cameras  # Corrected cameras
-    time_offset: np.ndarray  # (C,) time offsets of the cameras, seconds
     flagged: np.ndarray  # (T,) frames not to be trusted
     contradicted: np.ndarray  # (T,) frames whose images contradict the object's pose
     penetrating: np.ndarray  # (T,) frames in which body and object are deep inside each other
@@ -88,7 +85,6 @@ class JointResult:
                 joint["contact_probability"].astype(float),
                 joint["contact_annotated"],
                 Cameras(rig, joint["depth_bias"]),
-                joint["time_offset"],
                 joint["flagged"],
                 np.array([CONTRADICTED in reason for reason in reasons]),
                 np.array([BODY_INSIDE in r or OBJECT_INSIDE in r for r in reasons]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import radians
 
 import numpy as np
@@ -11,8 +11,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.body.joints import FIRST_FINGER
 from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
 from intercap_core.body_fit.quality import LARGEST_HAND_SIGMA_M
-from intercap_core.geometry.camera.transforms import apply_step, rigid
-from intercap_core.geometry.solve.time_series import rigid_velocity
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.joint.hand_track import smooth_hands
 from intercap_core.joint.state import State
 
@@ -37,9 +36,7 @@ class TrackedPoses:
     rotation: np.ndarray  # (T, 3, 3) of master_from_object
     translation: np.ndarray  # (T, 3) of master_from_object, metres
     information: np.ndarray  # (T, 6, 6) inverse covariance of turn (left) and shift
-    twist: np.ndarray  # (T, 6) turn and shift per second; 0 at rest
     share: np.ndarray  # (T, C) 1 / n for each of the n cameras that show the object, else 0
-    time_offset: np.ndarray  # (C,) time offsets of the cameras that the tracker assumed, seconds
     seen: np.ndarray  # (T,) frames whose images determine the pose
     resting: np.ndarray  # (T,) frames in which the object rests
     times: np.ndarray  # (T,) seconds
@@ -54,7 +51,6 @@ class TrackedPoses:
         *,
         visible: np.ndarray,
         times: np.ndarray,
-        time_offset: np.ndarray,
     ) -> TrackedPoses:
         """Build from the arrays of an object track.
 
@@ -64,7 +60,6 @@ class TrackedPoses:
             marks: lost frames and others.
             visible: (T, C) views that show the object.
             times: (T,) seconds.
-            time_offset: (C,) seconds.
         """
         # standard deviations of turn (rad) and shift (m) to add, tuned on the studio:
         # difference of mesh and object; ambiguity, mostly of the rotation; frames without a pose
@@ -78,33 +73,16 @@ class TrackedPoses:
         added = np.where(several, ambiguous, smallest)
         spread = np.where(tracked[:, None], added, interpolated) ** 2
         total += np.eye(6) * spread[:, None, :]
-        twist = rigid_velocity(poses, ~marks.lost, times)
-        twist[marks.resting] = 0
         share = visible / np.maximum(visible.sum(axis=1, keepdims=True), 1)
         return cls(
             poses[:, :3, :3].copy(),
             poses[:, :3, 3].copy(),
             np.linalg.inv(total),
-            twist,
             share,
-            time_offset,
             tracked & ~marks.carried,
             marks.resting,
             times,
             spread,
-        )
-
-    def at(self, time_offset: np.ndarray) -> TrackedPoses:
-        """The poses if the cameras had these time offsets (C,), seconds.
-
-        If the cameras expose later than assumed, the tracked pose is that of a later time, and the
-        object is moved back along its twist. The delay is the mean change of the offsets of the
-        views that show the object.
-        """
-        late = self.share @ (time_offset - self.time_offset)
-        poses = apply_step(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
-        return replace(
-            self, rotation=poses[:, :3, :3], translation=poses[:, :3, 3], time_offset=time_offset
         )
 
 
@@ -175,7 +153,6 @@ class SequentialFits:
                 marks,
                 visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
                 times=scene["times"],
-                time_offset=scene["time_offset"],
             )
         sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
         unknown = lost | ~np.isfinite(sigma)

@@ -17,7 +17,6 @@ from intercap_core import artefacts
 from intercap_core.annotation import ContactInterval
 from intercap_core.body.artefact import put_parameters
 from intercap_core.config import digest
-from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.fit import fit
 from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
@@ -77,18 +76,17 @@ def run(
         put_parameters(writer, parameters, joints, betas=fitted.state.betas)
         _put_fit(writer, fitted)
         writer.put("hand_undetermined", inputs.sequential.flags.hands)
-        _put_cameras(writer, inputs.cameras)
-
-
-def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:
-    writer.put("camera_names", list(cameras.now.rig.names))
-    writer.put("master_from_colour", cameras.now.rig.master_from_colour)
-    writer.put("depth_bias", cameras.now.depth_bias)
-    writer.put("camera_covariance", cameras.covariance)
+        cameras = inputs.cameras
+        writer.put("camera_names", list(cameras.now.rig.names))
+        writer.put("master_from_colour", cameras.now.rig.master_from_colour)
+        writer.put("depth_bias", cameras.now.depth_bias)
+        writer.put("camera_covariance", cameras.covariance)
+        writer.put("time_offset", inputs.time_offset)
+        writer.put("time_offset_sigma", inputs.time_offset_sigma)
 
 
 def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:
-    """Write residuals, object, contact, time offsets, energies and flags."""
+    """Write residuals, object, contact, energies and flags."""
     before, after = fitted.energy_before, fitted.energy_after
     names = sorted(before.keys() | after.keys())
     writer.put("keypoint_residual", fitted.residuals.keypoint_px)
@@ -98,8 +96,6 @@ def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:
     writer.put("region_names", CONTACT_REGIONS)
     writer.put("contact_probability", fitted.contact.probability)
     writer.put("contact_annotated", fitted.contact.labels)
-    writer.put("time_offset", fitted.time_offsets.offset)
-    writer.put("time_offset_sigma", fitted.time_offsets.sigma)
     writer.put("energy_names", names)
     writer.put("energy_before", [before.get(name, 0.0) for name in names])
     writer.put("energy_after", [after.get(name, 0.0) for name in names])

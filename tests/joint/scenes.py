@@ -78,7 +78,6 @@ def tracked(state: State, sigma: float, lost: np.ndarray | None = None) -> Track
         TrackMarks(lost=no if lost is None else lost, ambiguous=no, carried=no, resting=no),
         visible=np.ones((count, 3), bool),
         times=np.arange(count) / FPS,
-        time_offset=np.zeros(3),
     )
 
 

@@ -1,4 +1,4 @@
-"""Corrections of cameras and time offsets from rendered captures, at the true bodies."""
+"""Corrections of cameras from rendered captures, at the true bodies."""
 
 from __future__ import annotations
 
@@ -28,12 +28,6 @@ from intercap_core.joint.cameras import (
 )
 from intercap_core.joint.state import BODY, OBJECT
 from intercap_core.joint.terms.body_data import add_by_cameras
-from intercap_core.joint.time_offsets import (
-    OffsetPrior,
-    estimate_offsets,
-    observe_clouds,
-    observe_keypoints,
-)
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import master_from_room, ring, write_capture
 
@@ -41,7 +35,6 @@ FPS, CAMERAS, WRONG = 15.0, 4, 2
 # Turn, rad, shift and depth bias, metres, that the wrong camera needs.
 NEEDED = np.array([0.002, -0.003, 0.002, 0.004, 0.003, -0.005, 0.0])
 LOOSE = np.repeat([0.02, 0.02, 0.02], (3, 3, 1)) ** 2
-LATE = np.array([0.0, 0.007, -0.006, 0.004])  # exposures after the times of the frames, seconds
 
 
 def moving_vectors(model: BodyModel, times: np.ndarray) -> torch.Tensor:
@@ -58,17 +51,16 @@ def moving_vectors(model: BodyModel, times: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(x, dtype=torch.float32)
 
 
-def _make_fitter(folder: Path, frames: int, late: np.ndarray) -> Fitter:
-    """Render a capture whose cameras expose ``late`` (C,), seconds."""
+def _make_fitter(folder: Path, frames: int) -> Fitter:
+    """Render a capture."""
     model = open_body()
-    times = np.arange(frames) / FPS
-    bodies = [model.forward(model.parameters(moving_vectors(model, times + at))) for at in late]
+    body = model.forward(model.parameters(moving_vectors(model, np.arange(frames) / FPS)))
     inputs = write_capture(
         folder,
         ring(CAMERAS),
-        np.stack([body.vertices.double().numpy() for body in bodies], 1),
+        body.vertices.double().numpy(),
         model.faces.numpy(),
-        np.stack([model.keypoints(body).double().numpy() for body in bodies], 1),
+        model.keypoints(body).double().numpy(),
     )
     observed = read_observations(inputs.scene, inputs.person)
     clouds = person_clouds(inputs.frames, observed, 3000)
@@ -91,53 +83,15 @@ def _problem(fitter: Fitter) -> BodyProblem:
 
 
 @pytest.fixture(scope="module")
-def late_fitter(tmp_path_factory) -> Fitter:
-    """The cameras expose ``LATE``, which the fitter does not know."""
-    return _make_fitter(tmp_path_factory.mktemp("late"), 12, LATE)
-
-
-@pytest.fixture(scope="module")
 def fitter(tmp_path_factory) -> Fitter:
     """One camera's pose is wrong."""
-    fitter = _make_fitter(tmp_path_factory.mktemp("cameras"), 8, np.zeros(CAMERAS))
+    fitter = _make_fitter(tmp_path_factory.mktemp("cameras"), 8)
     step = np.zeros((CAMERAS, FREEDOMS))
     step[WRONG] = -NEEDED
     seen = fitter.evidence.observations
     wrong = Cameras(seen.rig, seen.depth_bias).moved(step)
     fitter.evidence.take_cameras(wrong.rig, wrong.depth_bias)
     return fitter
-
-
-# --- time offsets
-
-
-def test_velocities_are_the_change_with_exposure_time(late_fitter):
-    evidence, step = late_fitter.evidence, 0.002
-    given, problem = evidence.observations, _problem(late_fitter)
-    before = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
-    evidence.observations = replace(given, time_offset=np.full(CAMERAS, step))
-    late_fitter.observe(problem)
-    after = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
-    evidence.observations = given
-    for a, b, tolerance in zip(before, after, (0.02, 0.05), strict=True):
-        same = (a.weight > 0) & (b.weight == a.weight)
-        change, expected = (b.residual - a.residual)[same], step * a.velocity[same]
-        assert np.median(np.abs(expected)) > 0
-        assert np.abs(change - expected).mean() < tolerance * np.abs(expected).mean()
-
-
-@pytest.mark.parametrize("observe", [observe_keypoints, observe_clouds])
-def test_offsets_are_estimated_at_the_true_bodies(late_fitter, observe):
-    seen = late_fitter.evidence.observations
-    observations = observe(late_fitter.evidence, _problem(late_fitter))
-    prior = OffsetPrior(np.zeros(CAMERAS), np.full(CAMERAS, np.nan), 0)
-    estimate = estimate_offsets([observations], seen.times, seen.time_offset, prior)
-    error = np.abs(estimate.offset - LATE)
-    assert error.max() < 1e-3
-    assert (error[1:] < 4 * estimate.sigma[1:] + 1e-4).all()
-
-
-# --- poses of cameras
 
 
 def _camera_evidence(fitter: Fitter, problem: BodyProblem, stiffness: float) -> CameraEvidence:

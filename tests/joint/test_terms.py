@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.config import JointSettings
-from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.floor import FloorPlane
@@ -323,24 +322,6 @@ def test_drift_weight_scales_all_but_an_object_at_rest(model):
 # --- the object's track
 
 
-def test_tracked_poses_follow_the_offsets_of_their_views():
-    """Two cameras are 2 and 4 ms later than the tracker assumed: the mean of both is 3 ms."""
-    times = np.arange(6) / 15
-    way = np.outer(times, [1.0, 0.0, 0.5])
-    seen = np.zeros((6, 3), bool)
-    seen[:, 1], seen[:3, 2] = True, True
-    no, lost = np.zeros(6, bool), np.arange(6) == 5
-    track = TrackedPoses.from_track(
-        rigid(np.repeat(np.eye(3)[None], 6, 0), way), np.repeat(np.eye(6)[None], 6, 0),
-        TrackMarks(lost=lost, ambiguous=lost, carried=no, resting=no),
-        visible=seen, times=times, time_offset=np.array([0.0, 0.001, 0.0]),
-    )  # fmt: skip
-    moved = track.at(np.array([0.0, 0.003, 0.004])).translation - way
-    late = np.array([3, 3, 3, 2, 2, 0]) * 1e-3
-    assert moved == pytest.approx(-late[:, None] * [1.0, 0.0, 0.5])
-    assert np.array_equal(track.at(track.time_offset).translation, way)
-
-
 def test_carried_poses_keep_their_own_deviations():
     """They are neither widened as lost or ambiguous ones, nor compared with images."""
     sigma = np.diag(np.repeat([0.1, 0.02], 3) ** 2)
@@ -348,7 +329,7 @@ def test_carried_poses_keep_their_own_deviations():
     marks = TrackMarks(lost, ambiguous | carried, carried, np.zeros(4, bool))
     track = TrackedPoses.from_track(
         np.repeat(np.eye(4)[None], 4, 0), np.repeat(sigma[None], 4, 0), marks,
-        visible=np.ones((4, 1), bool), times=np.arange(4.0), time_offset=np.zeros(1),
+        visible=np.ones((4, 1), bool), times=np.arange(4.0),
     )  # fmt: skip
     turn, shift = np.linalg.inv(track.information)[:, [0, 3], [0, 3]].T ** 0.5
     assert turn[[0, 2]] == pytest.approx(0.1, rel=0.01)

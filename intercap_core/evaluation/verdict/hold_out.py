@@ -81,7 +81,7 @@ class Refits:
             if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)
         self._bands = np.empty_like(self._rest.bands)
-        everything = np.ones((len(state), len(assembly.body.time_offset), 2), bool)
+        everything = np.ones((len(state), assembly.body.num_cameras, 2), bool)
         solution = self._solve(everything, gradients)
         self._descent, self.displaced = solution[..., 0], solution[..., 1:]
 
@@ -276,11 +276,10 @@ def _camera_pulls(assembly: Assembly, state: State, covariance: np.ndarray) -> n
 
 
 def _fix_to_result(assembly: Assembly, result: JointResult) -> None:
-    """Set cameras, time offsets and contact to those of the result."""
+    """Set cameras and contact to those of the result."""
     if assembly.contact is not None:
         assembly.contact.take_contact(result.probability, result.annotated)
-    assembly.body.take_cameras(result.cameras, result.time_offset)
-    assembly.object_.take_offsets(result.time_offset)
+    assembly.body.take_cameras(result.cameras)
     if isinstance(assembly.object_, ObjectImagesData):
         assembly.object_.take_cameras(result.cameras)
 

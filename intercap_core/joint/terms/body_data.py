@@ -14,7 +14,6 @@ the body had been displaced by the opposite.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,16 +35,7 @@ from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvide
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import BODY, BODY_SHIFT, State
 from intercap_core.joint.terms.term import Equation, JointTerm
-from intercap_core.joint.time_offsets import (
-    OffsetEstimate,
-    OffsetPrior,
-    estimate_offsets,
-    observe_clouds,
-    observe_keypoints,
-)
 from intercap_core.sequence_inputs import SequencePaths
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -172,20 +162,14 @@ class BodyData(JointTerm):
         energy[filled] = 0.5 * (precision * offset**2).sum(axis=1)
         return hessian, gradient, energy
 
-    def take_cameras(self, cameras: Cameras, time_offset: np.ndarray | None = None) -> None:
-        """Use these cameras from the next :meth:`refresh` on.
-
-        ``time_offset`` (C,) are their time offsets, seconds; None keeps the present ones.
-        """
-        evidence = self._fitter.evidence
-        evidence.take_cameras(cameras.rig, cameras.depth_bias)
-        if time_offset is not None:
-            evidence.observations = replace(evidence.observations, time_offset=time_offset)
+    def take_cameras(self, cameras: Cameras) -> None:
+        """Use these cameras from the next :meth:`refresh` on."""
+        self._fitter.evidence.take_cameras(cameras.rig, cameras.depth_bias)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
         """Gauss-Newton form of E_B by body and cameras; ``share`` is a frame's weight."""
         self._place(state)
-        count = FREEDOMS * len(self._fitter.evidence.observations.rig)
+        count = FREEDOMS * self.num_cameras
         hessian, gradient, _ = self._equations(state)
         cross = np.zeros((len(state), BODY.stop, count))
         seen = CameraEvidence(
@@ -216,34 +200,9 @@ class BodyData(JointTerm):
         return person
 
     @property
-    def time_offset(self) -> np.ndarray:
-        """(C,) time offset of each camera in the predictions, seconds."""
-        return self._fitter.evidence.observations.time_offset
-
-    def estimate_offsets(self, prior: OffsetPrior) -> OffsetEstimate:
-        """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
-        evidence, problem = self._fitter.evidence, self._problem
-        observations = [
-            replace(points, weight=points.weight * self._trusted[:, None, None])
-            for points in (observe_keypoints(evidence, problem), observe_clouds(evidence, problem))
-            if points is not None
-        ]
-        times = evidence.observations.times[evidence.frames]
-        offsets = estimate_offsets(observations, times, self.time_offset, prior)
-        log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
-        return offsets
-
-    def take_offsets(self, offset: np.ndarray) -> float:
-        """Use these time offsets (C,), seconds, unless all changes are negligible.
-
-        Returns the largest change.
-        """
-        evidence = self._fitter.evidence
-        change = float(np.abs(offset - self.time_offset).max())
-        if change > 0.0003:  # seconds: a hand at 3 m/s moves a millimetre
-            evidence.observations = replace(evidence.observations, time_offset=offset)
-            self._fitter.observe(self._problem)
-        return change
+    def num_cameras(self) -> int:
+        """Number C of cameras."""
+        return len(self._fitter.evidence.observations.rig)
 
     def _place(self, state: State) -> None:
         vector = state.parameters(self._fitter.model).vector()

@@ -23,7 +23,7 @@ from intercap_core.joint.terms.term import Equation, JointTerm
 
 
 class ObjectData(JointTerm):
-    """E_O about tracked poses, for the cameras' latest time offsets."""
+    """E_O about tracked poses."""
 
     name = "object_data"
     equation = Equation(
@@ -35,11 +35,7 @@ class ObjectData(JointTerm):
     )
 
     def __init__(self, tracked: TrackedPoses) -> None:
-        self._tracked = self._poses = tracked
-
-    def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Use the poses that time offsets (C,), seconds, give."""
-        self._poses = self._tracked.at(time_offset)
+        self._poses = tracked
 
     def add(self, state: State, equations: BandedEquations) -> None:
         equations.add_blocks(self.name, OBJECT, *self._equations(self._poses.information, state))
@@ -81,9 +77,6 @@ class NoObject(JointTerm):
 
     def __init__(self) -> None:
         pass
-
-    def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Do nothing: no pose depends on the offsets."""
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add ones to the diagonal, so that the step of these unknowns is 0."""

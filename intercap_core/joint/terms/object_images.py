@@ -139,13 +139,6 @@ class ObjectImagesData(JointTerm):
             for c, given in zip(self._cameras, self._geometry, strict=True)
         ]
 
-    def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Use these time offsets (C,), seconds, from the next :meth:`refresh` on."""
-        self._geometry = [
-            replace(given, time_offset_s=float(time_offset[c]))
-            for c, given in zip(self._cameras, self._geometry, strict=True)
-        ]
-
     def refresh(self, state: State) -> None:
         """Compare the images with ``state``."""
         poses = rigid(state.rotation, state.translation)
