@@ -236,6 +236,15 @@ def test_keypoints_are_scaled_from_the_stated_size_or_from_shares(tmp_path):
         read(tmp_path / "other", camera(1))
 
 
+@pytest.mark.parametrize(("factor", "noted"), [(1, False), (0.5, True), (0.25, True)])
+def test_keypoints_of_smaller_images_are_noted(tmp_path, factor, noted):
+    """Of https://github.com/aimagelab/dress-code/issues/4."""
+    person = np.reshape(person_of("coco"), (17, 3)) * (factor, factor, 1)
+    write_people(tmp_path, ["0.json", "1.json"], person.ravel().tolist())
+    notes = read(tmp_path, camera(2)).notes
+    assert ["images of half the size" in note for note in notes] == [True] * noted
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

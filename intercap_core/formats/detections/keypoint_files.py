@@ -71,6 +71,8 @@ class KeypointCleaner:
     """Number of points with more than the full confidence."""
     normalised: int = 0
     """Number of people with normalised coordinates."""
+    extent: float = 0.0
+    """Largest x or y of a point, as a share of the image's width or height."""
 
     def clean(self, people: np.ndarray) -> np.ndarray:
         """Return the usable people (P, 135, 3) as float32: x, y (px), confidence from 0 to 1.
@@ -92,6 +94,7 @@ class KeypointCleaner:
         known = seen & inside
         share = np.minimum(np.where(known, confidence, 0) / self.full_confidence, 1)
         result = np.where(known[..., None], np.stack([x, y, share], -1), 0).astype(np.float32)
+        self.extent = max(self.extent, float((result[..., :2] / self.size).max(initial=0)))
         present = known.any(-1)
         largest = result[..., :2].max((1, 2), initial=0)
         normalised = present & (largest <= MAX_SHARE)
@@ -108,6 +111,11 @@ class KeypointCleaner:
             notes.append(
                 f"{self.outside} of {self.seen} keypoints lie outside the image of "
                 f"{width}x{height} pixels and count as not seen{hint}"
+            )
+        if 0 < self.extent < 0.5 and not self.normalised:
+            notes.append(
+                f"all keypoints lie in the upper left quarter of the image of {width}x{height} "
+                "pixels; are they of images of half the size?"
             )
         if self.normalised:
             notes.append(

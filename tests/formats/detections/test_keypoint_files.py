@@ -31,12 +31,12 @@ def images(stems: tuple[str, ...] = ()) -> CameraImages:
 
 
 def whole(x: float = 100.0, **more) -> dict:
-    values = np.column_stack([x + np.arange(133), 3.0 * np.arange(133) + 5, np.full(133, 0.7)])
+    values = np.column_stack([x + np.arange(133), 6.0 * np.arange(133) + 5, np.full(133, 0.7)])
     return {"keypoints": values.ravel().tolist(), "score": 0.9} | more
 
 
 def openpose(*x: float) -> dict:
-    return {"people": [{"pose_keypoints_2d": [v for i in range(25) for v in (x_ + i, 9, 0.7)]}
+    return {"people": [{"pose_keypoints_2d": [v for i in range(25) for v in (x_ + i, 900, 0.7)]}
                        for x_ in x]}  # fmt: skip
 
 
@@ -193,7 +193,7 @@ def test_points_beyond_the_edge_are_removed_and_counted():
 
 
 def test_confidence_is_cut_and_scaled():
-    person = changed(nose=(5, 5, 1.3), neck=(5, 5, 4.0))
+    person = changed(nose=(1000, 5, 1.3), neck=(5, 5, 4.0))
     values = KeypointCleaner(SIZE)
     (cut,) = values.clean(person)
     assert cut[[0, 1], 2].tolist() == [1, 1] and cut[2, 2] == 0.5
