@@ -52,7 +52,7 @@ class Disagreement:
 
     def __str__(self) -> str:
         size = f"{self.error_px:.0f} px" if np.isfinite(self.error_px) else "no common point"
-        usual = f" beside {self.usual_px:.0f}" if np.isfinite(self.usual_px) else ""
+        usual = f" instead of {self.usual_px:.0f}" if np.isfinite(self.usual_px) else ""
         return f"{NOT_AGREEING} (keypoints {size}{usual}): {self.cause}"
 
 
@@ -80,8 +80,10 @@ def find_disagreements(
         first, second = (rig.names[c] for c in exchanged)
         words = f"poses, or images, of {first} and {second} are exchanged in the input"
         causes, parts = dict.fromkeys(exchanged, words), [None] * len(rig)
-    elif len(rig) - len(bad) < max(3, len(rig) / 2):  # no majority tells which cameras are wrong
-        words = "too few cameras agree to tell which: the calibration may be of another session"
+    elif len(rig) - len(bad) < max(3, len(rig) / 2):  # no majority shows which cameras are wrong
+        words = (
+            "too few cameras agree to identify the wrong ones: is it another session's calibration?"
+        )
         seen = np.flatnonzero(np.isfinite(shares).any(0)).tolist()
         causes = dict.fromkeys(seen, words if len(rig) > 2 else UNDETERMINED)
     else:

@@ -88,7 +88,7 @@ class PoseVerdict:
     @classmethod
     def of(cls, evidence: Sequence[HeldOutComparison]) -> PoseVerdict:
         """Decide from the evidence; every kind of data has the same weight."""
-        if not evidence:  # verdicts are only asked for if the refined rig as a whole is better
+        if not evidence:  # verdicts are only computed if the refined rig as a whole is better
             return cls(True, ())
         mean = np.mean([e.mean for e in evidence])
         sigma = np.sqrt(sum(e.sigma**2 for e in evidence)) / len(evidence)
@@ -97,8 +97,10 @@ class PoseVerdict:
 
     def __str__(self) -> str:
         if not self.evidence:
-            return "refined with the rig: nothing that was held out shows this camera by itself"
-        pose = "refined" if self.refined else "as given, refined it is not better beyond chance"
+            return "refined with the rig: no held-out data show this camera"
+        pose = (
+            "refined" if self.refined else "as given: the refined pose is not significantly better"
+        )
         return f"{pose} (held-out errors, {', '.join(map(str, self.evidence))})"
 
 
@@ -199,9 +201,9 @@ def describe_direction(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) 
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     level = direction - (direction @ up) * up
     along = abs(float(level @ ahead)) / np.linalg.norm(level)
-    way = "aslant to its view"
+    way = "oblique to its view"
     if along > 0.8:
         way = "along its view"
     elif along < np.sqrt(1 - 0.8**2):  # within 37 degrees of perpendicular
         way = "across its view"
-    return f"along the floor, {way}" if steep < 0.5 else f"aslant to the floor, {way}"
+    return f"along the floor, {way}" if steep < 0.5 else f"oblique to the floor, {way}"

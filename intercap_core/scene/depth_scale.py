@@ -20,7 +20,7 @@ FACTORS = sorted({f for k in (1.0, 2.0, 4.0, 5.0, 10.0, 100.0, 1000.0) for f in 
 IMAGES = 20  # of each camera, which hold hundreds of body points
 MIN_POINTS = 12  # half of the body points of one image
 # Depth of the skin over that of the joint: skin is nearer by up to 0.13 m at 1.3 m, feet stand on
-# the floor behind them. Narrow enough to tell 4 from 5.
+# the floor behind them. Narrow enough to distinguish 4 from 5.
 ON_THE_BODY = (0.87, 1.1)
 # Share of points on the body at which a factor is possible: objects in front of the person hide up
 # to 75 % of the points and may be at half of the distance. In 262 cameras of virtual recordings

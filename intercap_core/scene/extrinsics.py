@@ -178,7 +178,7 @@ def _verdicts(rig: Rig, master: int, own: dict[int, PoseVerdict], of_rig: str) -
     """Reason for each camera's pose: its own verdict, or that of the rig."""
     kept = "as given: " + of_rig.removesuffix(": poses as given")
     words = [str(own[c]) if c in own else kept for c in range(len(rig))]
-    words[master] = "the master, which the others are placed by"
+    words[master] = "the master, whose pose is fixed"
     return tuple(words)
 
 

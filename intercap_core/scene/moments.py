@@ -99,19 +99,19 @@ def describe_stated_start(
     start = float(whole * starts.step_s - offset)
     if starts.rejected[camera]:
         return (
-            f"{source} has it start {describe_start(late)}; the keypoints deny that and were "
-            f"followed: {describe_start(start)}"
+            f"{source} states that it started {describe_start(late)}; the keypoints contradict "
+            f"this and were used instead: {describe_start(start)}"
         )
     if not offset_sigma < 0.5 * stated.sigma[camera]:  # the keypoints add little
         return (
-            f"its start rests on {source}: {describe_start(start)}, known to {offset_sigma:.3f} s; "
-            "the keypoints tell too little"
+            f"its start is that of {source}: {describe_start(start)}, known to "
+            f"{offset_sigma:.3f} s; the keypoints do not determine it"
         )
     if whole == 0:
         return ""
     return (
-        f"it started {describe_start(start)}, and was brought into step: so say {source} and the "
-        "keypoints"
+        f"it started {describe_start(start)} according to {source} and the keypoints; its images "
+        "were moved"
     )
 
 

@@ -122,8 +122,9 @@ class StatedStarts:
         for c in np.flatnonzero(self.known).tolist():
             if abs(self.late[c]) > lasts - min(MIN_SHARED_S, lasts / 2):
                 raise UserError(
-                    f"{self.source[c]} has camera {names[c]} start {describe_start(self.late[c])}, "
-                    f"and the recording lasts {lasts:.1f} s: hardly any of it would be in common; "
+                    f"{self.source[c]} states that camera {names[c]} started "
+                    f"{describe_start(self.late[c])}, "
+                    f"and the recording lasts {lasts:.1f} s, so they hardly overlap; "
                     "state the starts in seconds, of one clock"
                 )
 
@@ -140,8 +141,8 @@ class StatedStarts:
                 continue
             if abs(late[c] - other.late[c]) > OUTLIER_SIGMA * np.hypot(sigma[c], other.sigma[c]):
                 odd[c] = (
-                    f"{source[c]} has it start {describe_start(late[c])}, {other.source[c]} "
-                    f"{describe_start(other.late[c])}: the first was taken"
+                    f"{source[c]} states that it started {describe_start(late[c])}, "
+                    f"{other.source[c]} {describe_start(other.late[c])}; the former is used"
                 )
                 continue
             late[c], sigma[c] = combine_estimates(
@@ -189,8 +190,8 @@ class StartTimes:
     undetermined: tuple[str, ...] = ()
     """(C,) reasons why the keypoints do not confirm a start, "" = they do; empty = not searched."""
     short: np.ndarray | None = None
-    """(C,) sets by which images seem to be late beyond ``sets``, too few to tell a start from a
-    slip."""
+    """(C,) sets by which images seem to be late beyond ``sets``, too few to
+    distinguish a start from a slip."""
     too_short: bool = False
     """The recording, or its number of frame sets, is too small for a search."""
 

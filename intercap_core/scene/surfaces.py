@@ -211,7 +211,7 @@ def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
 def _along_normals(surface: DepthSurface, points: np.ndarray) -> np.ndarray:
     """Displacement (N,) of the surface along each point's normal, metres; NaN = not found.
 
-    The nearest of the other ``points`` lies beside the normal. The displacement is its distance
+    The nearest of the other ``points`` does not lie on the normal. The displacement is its distance
     along the normal, and the search is repeated twice from the displaced point.
     """
     reach = 0.15  # metres from one set to the next: 2 m/s at 15 sets per second

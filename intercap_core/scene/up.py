@@ -235,7 +235,7 @@ def check_stated_up(
     off = degrees_between(stated, without.direction)
     if without.source == "gravity":
         note = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"
-        return [f"{note}, which were believed"] * (off > without.cone_deg)
+        return [f"{note}, which were used"] * (off > without.cone_deg)
     leans = degrees_between(stated, trunk)
     # a wrong axis is 90 degrees off; the cameras' mean up and the trunk of a bending person less
     wrong = 60.0

@@ -382,11 +382,11 @@ def _notes(
         for own, other in (swap.cameras, swap.cameras[::-1]):
             notes[own].append(
                 f"its focal length and principal point and those of {source.rig.names[other]} are "
-                f"exchanged in the calibration and were put right ({evidence})"
+                f"exchanged in the calibration and were corrected ({evidence})"
             )
     starts = moments.starts
     for c in np.flatnonzero(source.present & ~stated.known & (starts.sets != 0)).tolist():
-        notes[c].append(f"it started {describe_start(starts.late[c])}, and was brought into step")
+        notes[c].append(f"it started {describe_start(starts.late[c])}; its images were moved")
     for c in np.flatnonzero(source.present).tolist():
         left, sigma = float(refined.offset[c]), float(refined.offset_sigma[c])
         note = describe_stated_start(stated, starts, moments.slips, c, left, sigma)
@@ -410,7 +410,7 @@ def _notes(
         )
     for c, present in enumerate(source.present):
         if present and np.isnan(refined.offset_sigma[c]):
-            notes[c].append("its time offset could not be told")
+            notes[c].append("its time offset is not determined")
     return notes
 
 

@@ -1,7 +1,8 @@
 """Instance candidates with the errors of a segmentation network, in COCO's result format.
 
 Errors last for 0.3 to 1 s and partly agree between views: borders, labels, misses, merged person
-and object, false instances. The order is random, and scores hardly tell true from false instances.
+and object, false instances. The order is random, and scores hardly separate true from false
+instances.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Writer of Azure Kinect MKV recordings that the Azure Kinect SDK itself opens.
 
-Matroska is nested elements: an id, a length, a payload (RFC 8794, RFC 9559). What the SDK asks for
-on top (its ``matroska_read.cpp``, MIT): every image track is ``V_MS/VFW/FOURCC`` with a
+A Matroska file consists of nested elements: id, length, payload (RFC 8794, RFC 9559). The SDK (its
+``matroska_read.cpp``, MIT) also requires that every image track is ``V_MS/VFW/FOURCC`` with a
 BITMAPINFOHEADER and a frame period of exactly 1/5, 1/15 or 1/30 s, and the tags below. Muxers of
 general use write other codec ids, which it refuses.
 """

@@ -24,12 +24,12 @@ MAX_OFFSET_S = 0.008  # of the exposure relative to the device time, at noise 1
 
 @dataclass(frozen=True)
 class StudioRig:
-    """Cameras as they are and as they claim to be, in the master's colour frame."""
+    """True and calibrated cameras, in the master's colour frame."""
 
     true: Rig
     """True lenses and poses."""
     claimed: Rig
-    """Erring lenses of the recordings and erring poses of the rig file."""
+    """Calibrated lenses and poses, with errors, as in the recordings and the rig file."""
     master_from_stage: np.ndarray
     """(4, 4), metres."""
     offset_s: np.ndarray

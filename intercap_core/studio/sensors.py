@@ -141,7 +141,7 @@ class DepthSensor:
         kernel = cv2.getGaussianKernel(3, 0.9)
         unit = np.sqrt(self.smooth_share) / np.linalg.norm(kernel @ kernel.T)
         error += cv2.GaussianBlur(white, (3, 3), 0.9) * np.float32(unit)
-        if self._noise.family == "b":  # now and then a pixel is far off
+        if self._noise.family == "b":  # heavy tails
             error *= np.where(np.abs(white) > 2.2, np.float32(3.0), np.float32(0.85))
         sigma = depth * depth
         sigma *= np.float32(self.noise_per_m2)

@@ -29,7 +29,7 @@ def test_camera_is_refined_only_if_significantly_better() -> None:
     assert PoseVerdict.of([_evidence(0.1, 0.1), _evidence(*[1.02] * 100)]).refined
     assert not PoseVerdict.of([_evidence(0.9, 0.9), _evidence(*[1.02] * 100)]).refined
     nothing = PoseVerdict.of([])
-    assert nothing.refined and not nothing.doubtful and "nothing" in str(nothing)
+    assert nothing.refined and not nothing.doubtful and "no held-out data" in str(nothing)
 
 
 def test_evidence_pairs_units_that_both_have() -> None:
@@ -60,8 +60,8 @@ def test_weakest_motion_matches_sampled_poses() -> None:
         ((0.0, 0.0, -1.0), "up and down"),
         ((-1.0, 0.0, 0.0), "along the floor, along its view"),
         ((0.0, 1.0, 0.1), "along the floor, across its view"),
-        ((0.7, 0.7, 0.1), "along the floor, aslant to its view"),
-        ((0.0, 0.7, 0.7), "aslant to the floor, across its view"),
+        ((0.7, 0.7, 0.1), "along the floor, oblique to its view"),
+        ((0.0, 0.7, 0.7), "oblique to the floor, across its view"),
     ],
 )
 def test_directions_are_named_as_the_camera_sees_them(

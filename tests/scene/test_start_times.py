@@ -356,10 +356,10 @@ def test_keypoints_of_a_walker_reject_a_wrong_statement(fps, wrong):
         offset = result.timing.offset[c]
         return describe_stated_start(stated, starts, result.slips, c, offset, 0.002)
 
-    assert note(2).startswith("the annotation has it start") and "deny" in note(2)
+    assert note(2).startswith("the annotation states") and "contradict" in note(2)
     assert f"{abs(late[2] + wrong):.3f} s" in note(2)
     for c in (1, 3, 4, 5):
-        assert "and was brought into step: so say the annotation and the keypoints" in note(c)
+        assert "according to the annotation and the keypoints" in note(c)
 
 
 def test_offsets_reject_a_precise_but_wrong_statement():
@@ -390,7 +390,7 @@ def test_stated_starts_are_relative_to_the_times_of_the_files():
     np.testing.assert_allclose(stated.sigma, [np.nan, 0.05, np.nan])
     assert stated.sets(0.1).tolist() == [0, -15, 0] and stated.states_apart(0.1)
     assert describe_start(stated.late[1]) == "1.500 s later than its times say"
-    with pytest.raises(UserError, match=r"annotation has camera k2 start 1\.500 s later"):
+    with pytest.raises(UserError, match=r"annotation states that camera k2 started 1\.500 s later"):
         stated.check_common(np.array([0, 1.6]), names)
     stated.check_common(np.array([0, 3.0]), names)
 

@@ -49,7 +49,7 @@ class CalibrationReader:
     tool: str
     """Name of the tool."""
     rank: int
-    """Readers are asked in this order: a lower rank first."""
+    """Position in the order in which readers are tried; the lowest is first."""
     recognises: Callable[[Path], bool]
     """Whether a file or folder is a calibration of the tool."""
     read: Callable[[Path, RecordedCameras, float | None], Calibration]
@@ -72,7 +72,7 @@ class ToolCamera:
 
 @cache
 def calibration_readers() -> tuple[CalibrationReader, ...]:
-    """The readers of all tools, in the order in which they are asked."""
+    """The readers of all tools, in the order in which they are tried."""
     modules = modules_of("intercap_core.formats.calibration")
     readers = [module.READER for module in modules if hasattr(module, "READER")]
     return tuple(sorted(readers, key=lambda reader: (reader.rank, reader.tool)))

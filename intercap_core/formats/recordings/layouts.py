@@ -30,7 +30,7 @@ INPUTS: dict[LayoutName, tuple[str, ...]] = {
 }
 # Suffixes of other files in such a folder, such as the studio's truth.
 _NO_RECORDINGS = {".h5", ".json", ".yaml", ".yml", ".toml", ".txt", ".tsv", ".part"}
-_DEEPEST = 3  # levels of folders below the recordings that are looked at
+_DEEPEST = 3  # levels of folders below the recordings that are searched
 # Paths below the folder of recordings that the layouts read, and their description. A folder whose
 # path with "/" matches is read as a whole. Names in braces are those of :func:`list_unread`.
 _READ: dict[LayoutName, tuple[str, str]] = {

@@ -15,7 +15,7 @@ first pixel. A calibration is valid only up to ``metric_radius`` = sqrt(s). Beyo
 rational factor may decrease, so that points far outside would be projected into the image. There
 the map is continued linearly along the ray from the principal point: the distorted position at the
 metric radius is scaled by radius / metric_radius. Projections are therefore finite and monotone.
-:func:`inside_model` tells which points the calibration covers.
+:func:`inside_model` returns which points the calibration covers.
 """
 
 from __future__ import annotations

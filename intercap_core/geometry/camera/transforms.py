@@ -42,7 +42,7 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(transform: np.ndarray, tolerance: float = 1e-4) -> bool:
-    """Tell whether one (4, 4) array is finite, proper and orthonormal within ``tolerance``."""
+    """Return whether one (4, 4) array is finite, proper and orthonormal within ``tolerance``."""
     if transform.shape != (4, 4) or not np.all(np.isfinite(transform)):
         return False
     rotation = transform[:3, :3]

@@ -24,9 +24,10 @@ import igl
 import numpy as np
 import trimesh
 
-# Directions of rays whose crossings are counted. A point is outside if the first ray says so (no
-# error on 10,000 points). Else all five vote, since a ray may pass along an edge. The directions
-# are oblique to the coordinate planes, which faces of modelled objects are often parallel to.
+# Directions of rays whose crossings are counted. A point is outside if the first ray has an even
+# number of crossings (no error on 10,000 points). Else all five vote, since a ray may pass along an
+# edge. The directions are oblique to the coordinate planes, to which faces of modelled objects are
+# often parallel.
 _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
@@ -154,7 +155,7 @@ class DistanceField:
         """Return whether points (N, 3) are inside the solid: (N,) bool.
 
         In a watertight mesh, points outside of the bounding box need no ray, and most others one.
-        If this ray says inside, the majority of five rays decides: a ray through an edge may count
+        If it is odd, the majority of five rays decides: a ray through an edge may count
         it twice or not at all.
         """
         query = np.asarray(points, np.float32).reshape(-1, 3)

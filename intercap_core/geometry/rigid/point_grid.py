@@ -26,8 +26,8 @@ class PointGrid:
 
         Errors are up to 1e-6 of the coordinates' size. Fastest if consecutive queries are close.
         """
-        asked = np.ascontiguousarray(queries, np.float32)
-        return np.sqrt(_nearest(asked, *self._cells).astype(np.float64))
+        points = np.ascontiguousarray(queries, np.float32)
+        return np.sqrt(_nearest(points, *self._cells).astype(np.float64))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -88,7 +88,7 @@ class KeypointReader:
     load: Callable[[Path], Any] = read_json
     """Loads a file. Readers with the same function share the files that their names match."""
     rank: int = 1
-    """Readers are asked in this order: a lower rank first."""
+    """Position in the order in which readers are tried; the lowest is first."""
 
     def match_images(self, paths: Iterable[Path]) -> dict[str, Path]:
         """Files that may hold one image, by the image's name."""
@@ -112,7 +112,7 @@ def layouts() -> dict[str, KeypointLayout]:
 
 @cache
 def readers() -> tuple[KeypointReader, ...]:
-    """All readers in the order in which they are asked."""
+    """All readers in the order in which they are tried."""
     modules = modules_of("intercap_core.formats.detections.keypoints")
     unsorted = [module.READER for module in modules if hasattr(module, "READER")]
     return tuple(sorted(unsorted, key=lambda reader: (reader.rank, reader.tool)))
