@@ -19,8 +19,8 @@ from intercap_core.body.keypoints import FACE
 from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body_fit.first_hit import first_hits
 from intercap_core.geometry.rigid import surfaces as rigid_surfaces
+from intercap_core.geometry.rigid.distance import DistanceField
 
 # Scale of unit normals n in the distance of a match, |p - q|^2 + (scale |n_p - n_q|)^2: metres per
 # radian. Tuned on the studio.
@@ -164,8 +164,7 @@ def _flag_outer_skin(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -
     head = [JOINT_INDEX[n] for n in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")]
     ids = np.flatnonzero(outer & np.isin(joint, head))
     normals = rigid_surfaces.vertex_normals(points, faces)[ids]
-    hits = first_hits(points, faces, points[ids] + 1e-3 * normals, normals)
-    outer[ids[np.isfinite(hits)]] = False
+    outer[ids[DistanceField(points, faces).met(points[ids] + 1e-3 * normals, normals)]] = False
     return outer
 
 

@@ -8,15 +8,13 @@ like a finger that passed through the wall of a cup.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import trimesh
 
 from intercap_core import artefacts
 from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.tracks import read_body, read_object
-from intercap_core.geometry.rigid.distance import DistanceField, build_scene, o3d
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.schemas import CONTACT_M, METRICS
@@ -74,19 +72,15 @@ def behind_wall(
     result = np.zeros(len(points), bool)
     if len(points) == 0:
         return result
-    wall, skin = (
-        build_scene(vertices.astype(np.float32, "C"), faces.astype(np.uint32, "C"), 1)
-        for vertices, faces in (object_, body)
-    )
-    solid = DistanceField(*object_, threads=1)
-    inside = DistanceField(*body, threads=1).inside(points)
+    wall, skin = DistanceField(*object_, threads=1), DistanceField(*body, threads=1)
+    inside = skin.inside(points)
     result[inside] = True
     for ray in _directions(_LINES):
         along = normals @ ray
         ahead = np.sign(along)[:, None] * ray
-        through = _first_hit(skin, points, -ahead)
-        crosses = _first_hit(wall, points - _OFF_M * ahead, -ahead) < through
-        sooner = _first_hit(skin, points, ahead) < through
+        through = skin.first_hit(points, -ahead)
+        crosses = wall.first_hit(points - _OFF_M * ahead, -ahead) < through
+        sooner = skin.first_hit(points, ahead) < through
         result[inside] &= ((crosses & sooner) | (abs(along) < _STEEP))[inside]
     triangles = body[0][body[1]]
     low, high = points.min(0) - CONTACT_M, points.max(0) + CONTACT_M
@@ -98,8 +92,8 @@ def behind_wall(
         ways, length = ways[length < CONTACT_M + _OFF_M], length[length < CONTACT_M + _OFF_M]
         along = ways / np.maximum(length, _OFF_M)[:, None]
         starts = points[at] + _OFF_M * along
-        blocked = _first_hit(wall, starts, along) < length - 2 * _OFF_M
-        result[at] = (blocked | solid.inside(starts)).all()
+        blocked = wall.first_hit(starts, along) < length - 2 * _OFF_M
+        result[at] = (blocked | wall.inside(starts)).all()
     return result
 
 
@@ -109,9 +103,3 @@ def _directions(count: int) -> np.ndarray:
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
     flat = np.sqrt(1 - height**2)
     return np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
-
-
-def _first_hit(scene: Any, starts: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the length (N,) of rays (N, 3) to the first surface, metres; inf without one."""
-    rays = np.concatenate([starts, directions], axis=1).astype(np.float32)
-    return scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy().astype(float)

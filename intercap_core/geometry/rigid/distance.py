@@ -151,6 +151,14 @@ class DistanceField:
         rays = o3d.core.Tensor.from_numpy(np.concatenate([start, ahead], 1).astype(np.float32))
         return self._scene.test_occlusions(rays).numpy()
 
+    def first_hit(self, start: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """Return the length (N,) of rays from ``start`` (N, 3) along unit vectors to the surface.
+
+        Metres; infinite if a ray hits nothing.
+        """
+        rays = o3d.core.Tensor.from_numpy(np.concatenate([start, ahead], 1).astype(np.float32))
+        return self._scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)
+
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return whether points (N, 3) are inside the solid: (N,) bool.
 
