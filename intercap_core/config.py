@@ -430,7 +430,8 @@ class Config(Model):
     annotations: Path = Path("annotations")
     """Folder of <sequence>.yaml files, all optional."""
     results: Path = Path("results")
-    """Folder of all results, relative to the folder in which the workflow runs."""
+    """Folder of all results, relative to the folder that
+    holds ``config/``, or to that of a settings file outside of ``config/``."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of the fits: the CPU; cuda is refused with an error."""
     body_models: BodyModels = BodyModels()

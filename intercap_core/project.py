@@ -47,9 +47,23 @@ class Project:
         return self.config.results / self.config.dataset
 
     @property
+    def root(self) -> Path:
+        """Folder in which the workflow runs and below which it writes; see :func:`root_of`."""
+        return root_of(self.path)
+
+    @property
     def logs(self) -> Path:
         """Folder of this dataset's logs."""
-        return Path("logs") / self.config.dataset
+        return tidy(self.root / "logs" / self.config.dataset)
+
+    @property
+    def benchmarks(self) -> Path:
+        """Folder of the seconds and the memory that each of this dataset's jobs took."""
+        return tidy(self.root / "benchmarks" / self.config.dataset)
+
+    def target(self, path: Path) -> str:
+        """A path as the workflow names it: relative to the root if it lies below it."""
+        return str(tidy(path, self.root))
 
     def require_sequence(self, name: str) -> None:
         """Raise UserError if the table of sequences has no such row."""
@@ -214,9 +228,8 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     if not sequences:
         raise UserError(f"{table}: holds no sequence (or all are excluded); add at least one row")
     sections = {name: value for name, value in config if isinstance(value, BaseModel)}
-    config = config.model_copy(
-        update={name: _absolute(value, path.parent) for name, value in sections.items()}
-    )
+    moved = {name: _absolute(value, path.parent) for name, value in sections.items()}
+    config = config.model_copy(update={**moved, "results": tidy(root_of(path) / config.results)})
     if config.device == "cuda":
         raise UserError(
             f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
@@ -341,10 +354,21 @@ def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path)
             )
 
 
-def tidy(path: Path) -> Path:
-    """The path without "..", relative to the working directory if it lies below it."""
+def root_of(settings: Path) -> Path:
+    """Root of the project of a settings file: relative results, logs and benchmarks lie below it.
+
+    It is the folder that holds ``config/`` for ``config/*.yaml`` and ``config/<name>/*.yaml``, as
+    Snakemake's conventions have it; otherwise the folder of the settings file.
+    """
+    folder = Path(os.path.abspath(settings)).parent
+    near = (folder, folder.parent)
+    return tidy(next((place.parent for place in near if place.name == "config"), folder))
+
+
+def tidy(path: Path, folder: Path | None = None) -> Path:
+    """The path without "..", relative to ``folder`` (the working directory) if it lies below it."""
     absolute = Path(os.path.abspath(path))
-    here = Path.cwd()
+    here = Path.cwd() if folder is None else Path(os.path.abspath(folder))
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 

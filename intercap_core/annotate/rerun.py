@@ -60,7 +60,7 @@ def stale_stages(project: Project, sequence: str) -> list[dict[str, Any]]:
 
 def targets(project: Project, sequence: str) -> list[str]:
     """Return the Snakemake targets that compute all stages of one sequence."""
-    return [str(project.artefact(sequence, stage)) for stage in LEAVES]
+    return [project.target(project.artefact(sequence, stage)) for stage in LEAVES]
 
 
 def command(

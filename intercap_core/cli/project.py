@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -28,6 +28,78 @@ class ReleasedKind(StrEnum):
     site = "site"
     export = "export"
     artefact = "artefact"
+
+
+@app.command()
+def init(
+    root: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of recordings, or of an unpacked release."),
+    ],
+    output: Annotated[Path, typer.Option(help="Project folder for config.yaml and tables.")] = Path(
+        "."
+    ),
+    dataset: Annotated[
+        str | None, typer.Option(help="Name of the dataset; default: that of FOLDER or release.")
+    ] = None,
+    calibrations: Annotated[
+        Path | None, typer.Option(help="InterCap: folder of calibration_first, _second, _third.")
+    ] = None,
+    annotations: Annotated[
+        Path | None, typer.Option(help="InterCap: folder of subject01_motion01_seg0, ...")
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="Folder of the objects' meshes; InterCap: of 01.ply, ...")
+    ] = None,
+    objects: Annotated[
+        Path | None, typer.Option(help="objects.yaml to use instead of meshes.")
+    ] = None,
+    keypoints: Annotated[
+        Path | None, typer.Option(help="Keypoint files, a folder for each sequence.")
+    ] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(help="Segmentations, a folder for each sequence.")
+    ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            help="Released results that replace the joint fit in metrics and pages, a folder for "
+            "each sequence. InterCap: its Res/ folder. BEHAVE: the dataset's folder, or the folder "
+            "of its 30 fps parameters with meshes."
+        ),
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite existing files.")] = False,
+) -> None:
+    """Write settings and tables for the recordings in a folder, then check them.
+
+    Recognises layouts, cameras, calibrations, keypoints, candidates and meshes, and copies of
+    InterCap's and BEHAVE's releases. The folder itself is not changed. Entries that cannot be
+    recognised get a default and a comment that begins with FILL IN.
+
+    Examples: intercap init ~/recordings --output lab; intercap init ~/InterCap --output intercap;
+    intercap init ~/BEHAVE --results ~/BEHAVE --dataset theirs --output theirs
+    """
+    from intercap_core.commands.init import print_draft, write_tables
+    from intercap_core.tables.project_files import Sources
+
+    sources = Sources(calibrations, annotations, meshes, keypoints, candidates, results)
+    draft, written = write_tables(
+        root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
+    )
+    print_draft(draft, root)
+    typer.echo(f"written: {', '.join(map(str, written))}")
+    check(written[0])
+
+
+@app.command(
+    hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)
+def tables(context: typer.Context, layout: str) -> None:
+    """Former name of `init`, with the name of the release as first argument.
+
+    Example: intercap tables intercap ~/InterCap --output config/intercap
+    """
+    context.find_root().command.main(["init", *context.args], standalone_mode=False)
 
 
 @app.command()
@@ -62,71 +134,6 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
     if faults:
         raise typer.Exit(1)
-
-
-@app.command()
-def tables(
-    layout: Annotated[
-        Literal["intercap", "behave"],
-        typer.Argument(metavar="LAYOUT", help="Released dataset: intercap or behave."),
-    ],
-    root: Annotated[Path, typer.Argument(help="Folder of the unpacked release.")],
-    output: Annotated[
-        Path, typer.Option(help="Folder for config.yaml and its tables, such as config/intercap.")
-    ],
-    dataset: Annotated[
-        str | None, typer.Option(help="Name of the dataset; default: the layout's name.")
-    ] = None,
-    calibrations: Annotated[
-        Path | None, typer.Option(help="intercap: folder of calibration_first, _second, _third.")
-    ] = None,
-    annotations: Annotated[
-        Path | None, typer.Option(help="intercap: folder of subject01_motion01_seg0, ...")
-    ] = None,
-    meshes: Annotated[
-        Path | None, typer.Option(help="intercap: folder of the release's 01.ply, 02.ply, ...")
-    ] = None,
-    objects: Annotated[
-        Path, typer.Option(help="intercap without meshes: the objects.yaml to use.")
-    ] = Path("config/objects.yaml"),
-    keypoints: Annotated[
-        Path | None, typer.Option(help="intercap: keypoint files, a folder for each sequence.")
-    ] = None,
-    candidates: Annotated[
-        Path | None, typer.Option(help="intercap: segmentations, a folder for each sequence.")
-    ] = None,
-    results: Annotated[
-        Path | None,
-        typer.Option(
-            help="Released results that replace the joint fit in metrics and pages, a folder for "
-            "each sequence. InterCap: its Res/ folder. BEHAVE: the dataset's folder, or the folder "
-            "of its 30 fps parameters with meshes."
-        ),
-    ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Overwrite existing files.")] = False,
-) -> None:
-    """Write a project's settings, tables and annotations for a released dataset.
-
-    The release itself is not changed. Missing and contradictory entries are printed, and written
-    as remarks into the tables: read them before you run.
-
-    Examples: intercap tables intercap ~/InterCap --output config/intercap;
-    intercap tables intercap ~/InterCap --results ~/InterCap/Res --dataset theirs --output
-    config/theirs; intercap tables behave ~/BEHAVE --output config/behave; intercap tables behave
-    ~/BEHAVE --results ~/BEHAVE --dataset theirs --output config/theirs
-    """
-    from intercap_core.commands.tables import write_tables
-    from intercap_core.tables.intercap import Sources
-
-    sources = Sources(calibrations, annotations, meshes, keypoints, candidates, results)
-    draft, written = write_tables(
-        layout, root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
-    )
-    for remark in draft.all_remarks():
-        typer.echo(f"note: {remark}", err=True)
-    for path in written:
-        typer.echo(path)
-    typer.echo(f"{len(draft.rows)} sequences; next: intercap check {output / 'config.yaml'}")
 
 
 @app.command(

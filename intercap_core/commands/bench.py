@@ -44,9 +44,9 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     sequence = next(iter(project.sequences))
     recordings = project.recordings_made(sequence)
     if recordings is not None:
-        _run(settings, str(recordings / "capture.json"), cores)
+        _run(project, recordings / "capture.json", cores)
     shutil.rmtree(project.results / sequence, ignore_errors=True)
-    seconds, peak = _run(settings, str(project.artefact(sequence, "metrics")), cores)
+    seconds, peak = _run(project, project.artefact(sequence, "metrics"), cores)
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as source:
         frames, cameras = source["colour_index"].shape
     figures = {
@@ -88,13 +88,15 @@ def replace_figures(output: Path, figures: Mapping[str, float], prefixes: tuple[
     output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
 
-def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
-    """Run the workflow up to ``target``; returns seconds and peak resident bytes."""
+def _run(project: Project, path: Path, cores: int) -> tuple[float, int]:
+    """Run the workflow up to ``path``; returns seconds and peak resident bytes."""
     import psutil
 
     start = time.monotonic()
+    arguments = [project.target(path), "--quiet", "all"]
     process = subprocess.Popen(
-        [*snakemake_command(settings, cores=cores, arguments=[target]), "--quiet", "all"],
+        snakemake_command(project, cores=cores, arguments=arguments),
+        cwd=project.root,
         stdout=sys.stderr,
     )
     tree, peak = psutil.Process(process.pid), 0
@@ -108,7 +110,7 @@ def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
         peak = max(peak, total)
         time.sleep(0.1)
     if process.returncode:
-        raise UserError(f"the run up to {target} failed; its messages are above")
+        raise UserError(f"the run up to {path} failed; its messages are above")
     return time.monotonic() - start, peak
 
 
@@ -116,7 +118,7 @@ def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
     """Figures of each stage, from the workflow's benchmark files."""
     figures = {}
     for stage in MEASURED:
-        path = Path("benchmarks") / project.config.dataset / sequence / f"{stage}.tsv"
+        path = project.benchmarks / sequence / f"{stage}.tsv"
         with open(path, encoding="utf-8") as file:
             row = next(csv.DictReader(file, delimiter="\t"))
         figures[f"{stage}.seconds_per_frame"] = round(float(row["s"]) / frames, 4)

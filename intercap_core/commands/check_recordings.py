@@ -212,6 +212,7 @@ def _notes_on_keypoints(
                     layout=settings.keypoint_layout,
                 )
                 notes += preview.notes
+                findings.faults += preview.faults
                 findings.add_recognised("keypoints", preview.recognised)
         elif settings.keypoint_model is None:
             notes.append(

@@ -65,21 +65,21 @@ def run_workflow(
     Args:
         cores: number of cores; 0 for all, or for the profile's.
         profile: folder of a Snakemake workflow profile.
-        arguments: further arguments of Snakemake.
+        arguments: further arguments of Snakemake; paths are relative to the project's root.
     """
     project = load_project(settings)
     check_bodies(project)
     console = Console(stderr=True)
     if DRY_RUN & set(arguments):
-        command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
-        return subprocess.call(command)
+        command = snakemake_command(project, cores=cores, profile=profile, arguments=arguments)
+        return subprocess.call(command, cwd=project.root)
     if not arguments and Plan(project).all_done():
         count = len(project.sequences)
         console.print(f"nothing to do: all {count} sequences are done", highlight=False)
         _print_report(project, console)
         return 0
     with _exclusive(project, console):
-        return _run(project, settings, cores, profile, arguments, console)
+        return _run(project, cores, profile, arguments, console)
 
 
 @contextmanager
@@ -92,7 +92,7 @@ def _exclusive(project: Project, console: Console) -> Iterator[None]:
     try:
         killed = lease.expired_owner
         if killed is not None and killed.host == socket.gethostname():
-            snakemake = find_snakemake(Path.cwd())
+            snakemake = find_snakemake(project.root.resolve())
             if snakemake:
                 raise UserError(
                     f"{project.results}: the run by {killed} was killed, but its jobs are still "
@@ -132,7 +132,6 @@ def _acquire_run_lease(project: Project, console: Console) -> Lease:
 
 def _run(
     project: Project,
-    settings: Path,
     cores: int,
     profile: Path | None,
     arguments: Sequence[str],
@@ -142,7 +141,7 @@ def _run(
 
     If some sequences fail, the outputs of all sequences are made from the others.
     """
-    command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
+    command = snakemake_command(project, cores=cores, profile=profile, arguments=arguments)
     watcher = Watcher(project, console)
     try:
         status = run_watched(command, watcher, console)
@@ -170,10 +169,10 @@ def _run(
     )
     if bad and len(bad) < len(project.sequences) and not arguments:
         console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
-        targets = [str(project.results / name) for name in AGGREGATES]
+        targets = [project.target(project.results / name) for name in AGGREGATES]
         excluded = ",".join([*project.config.exclude, *bad])
         others = [*targets, "--config", f"exclude=[{excluded}]"]
-        command = snakemake_command(settings, cores=cores, profile=profile, arguments=others)
+        command = snakemake_command(project, cores=cores, profile=profile, arguments=others)
         run_watched(command, Watcher(project, console), console)
     print_remarks(project, console)
     _print_report(project, console)
@@ -182,7 +181,7 @@ def _run(
 
 def _full_disk(project: Project) -> str:
     """Error message about a full disk among those that a run writes to; "" if none is full."""
-    for place in (project.results, project.logs, Path.cwd()):
+    for place in (project.results, project.logs, project.root):
         if free_bytes(place) < 1_000_000:
             return f"the disk of {place} is full; free space, then run again to continue"
     return ""
@@ -196,20 +195,23 @@ def _print_report(project: Project, console: Console) -> None:
 
 
 def snakemake_command(
-    settings: Path,
+    project: Project,
     *,
     cores: int = 0,
     profile: Path | None = None,
     arguments: Sequence[str] = (),
 ) -> list[str]:
-    """Command line that runs a project's workflow; arguments as of :func:`run_workflow`."""
+    """Command line that runs a project's workflow in the project's root.
+
+    Arguments as of :func:`run_workflow`.
+    """
     if profile is not None and not profile.is_dir():
         raise UserError(f"{profile}: is no folder; name a profile such as profiles/slurm")
     return [
         *(sys.executable, "-m", "snakemake"),
         *("--snakefile", str(snakefile())),
-        *("--configfile", str(settings)),
-        *(("--workflow-profile", str(profile)) if profile is not None else ()),
+        *("--configfile", project.target(project.path)),
+        *(("--workflow-profile", os.path.abspath(profile)) if profile is not None else ()),
         *(("--cores", str(cores) if cores else "all") if cores or profile is None else ()),
         *arguments,
     ]
@@ -235,6 +237,7 @@ class Watcher:
         self._printed: set[str] = set()
         self._printed_at = time.monotonic()
         self._logs = project.logs
+        self._root = project.root
         self.transcript = self._logs / "snakemake.log"
 
     def start(
@@ -248,6 +251,7 @@ class Watcher:
                 command,
                 stdout=output,
                 stderr=subprocess.STDOUT,
+                cwd=self._root,
                 env={**os.environ, "NO_COLOR": "1"},
                 pass_fds=pass_fds,
             )

@@ -16,6 +16,12 @@ from intercap_core.tables.project_files import Draft, Row
 SEQUENCE = re.compile(r"(Date\d{1,4})_(Sub\d{1,4})_([A-Za-z0-9]+)(?:_[A-Za-z0-9_-]+)?")
 
 
+def is_release(root: Path) -> bool:
+    """Whether the folder is a copy of the data set."""
+    folder = root / "sequences"
+    return folder.is_dir() and any(SEQUENCE.fullmatch(path.name) for path in folder.iterdir())
+
+
 def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
     """List the sequences of the data set.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.intercap import find_camera_folders, find_images
 from intercap_core.inputs.documents import read_yaml
+from intercap_core.shipped import shipped
 from intercap_core.tables.intercap_annotations import Key, convert, find_annotation_folders
-from intercap_core.tables.project_files import Draft, Row
+from intercap_core.tables.project_files import Draft, Row, Sources
 
 OBJECTS = (
     "suitcase", "skateboard", "football", "umbrella", "tennis_racquet", "toolbox", "chair",
@@ -26,25 +26,9 @@ CALIBRATIONS = ("first", "second", "third")
 _NUMBER, _SEGMENT = re.compile(r"\d{1,2}"), re.compile(r"seg_?(\d{1,2})", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Folders of the release other than the images.
-
-    The first three are searched for near the images if they are None; the others are optional.
-    """
-
-    calibrations: Path | None = None
-    """Holds ``calibration_first``, ``calibration_second`` and ``calibration_third``."""
-    annotations: Path | None = None
-    """Holds a folder for each sequence."""
-    meshes: Path | None = None
-    """Holds ``01.ply``, ``02.ply``, ..."""
-    keypoints: Path | None = None
-    """Holds a folder for each sequence."""
-    candidates: Path | None = None
-    """Holds a folder for each sequence."""
-    results: Path | None = None
-    """The release's own results, a folder for each sequence."""
+def is_release(root: Path) -> bool:
+    """Whether the folder is a copy of the release, or its folder of images."""
+    return (root / "RGBD_Images").is_dir() or bool(_sequence_folders(root))
 
 
 def find_stated_calibration(subject: int, object_number: int) -> str | None:
@@ -57,7 +41,7 @@ def find_stated_calibration(subject: int, object_number: int) -> str | None:
     return None if subject == 4 and early else "second"
 
 
-def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft:
+def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -> Draft:
     """List the sequences of the release.
 
     Raises UserError if there are no sequences or no calibrations.
@@ -66,7 +50,8 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
         root: the folder ``RGBD_Images``, or the one that holds it.
         sources: the other folders of the release.
         dataset: name of the project.
-        objects: objects.yaml to use if the release's meshes are missing.
+        objects: objects.yaml to use if the release's meshes are missing; None = that of the
+            package.
     """
     images = root / "RGBD_Images" if (root / "RGBD_Images").is_dir() else root
     folders = _sequence_folders(images)
@@ -90,6 +75,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
         _annotate(row, annotated.pop(key, []), numbers, result, with_pose=meshes is not None)
         result.subjects[f"s{key[0]:02d}"] = "male" if key[0] in MALE else "female"
         result.rows.append(row)
+    objects = objects or shipped("config/objects.yaml")
     result.objects = _objects(folders, meshes, objects, result)
     if annotated:
         result.remarks.append(f"{len(annotated)} sequences of {annotations_root} have no images")
@@ -242,14 +228,9 @@ def _objects(
 ) -> Path | dict[str, dict[str, Any]]:
     """Entries for the release's meshes, or the path of objects.yaml without meshes."""
     used = Counter(key[1] for key in folders)
-    known = read_yaml(objects) if objects.is_file() else {}
+    known = read_yaml(objects)
     known = known if isinstance(known, dict) else {}
     if meshes is None:
-        if not objects.is_file():
-            raise UserError(
-                f"{objects}: there is no such file of objects; name one with --objects, or the "
-                "release's meshes with --meshes"
-            )
         result.remarks.append(
             f"objects are those of {objects}, not the release's own: name its meshes with --meshes "
             "(without them its first poses of objects do not apply and are left out)"

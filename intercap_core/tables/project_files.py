@@ -13,9 +13,30 @@ from intercap_core.inputs.documents import dump_yaml
 
 COLUMNS = (
     "sequence", "subject", "object", "layout", "recordings", "calibration", "keypoints",
-    "candidates", "results", "annotation",
+    "candidates", "results", "truth", "annotation",
 )  # fmt: skip
 REQUIRED = [name for name, info in SequenceEntry.model_fields.items() if info.is_required()]
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Folders outside of that of the recordings.
+
+    None = searched for near the recordings; results are optional.
+    """
+
+    calibrations: Path | None = None
+    """Holds ``calibration_first``, ``calibration_second`` and ``calibration_third``."""
+    annotations: Path | None = None
+    """Holds a folder for each sequence."""
+    meshes: Path | None = None
+    """Holds ``01.ply``, ``02.ply``, ..."""
+    keypoints: Path | None = None
+    """Holds a folder for each sequence."""
+    candidates: Path | None = None
+    """Holds a folder for each sequence."""
+    results: Path | None = None
+    """The release's own results, a folder for each sequence."""
 
 
 @dataclass
@@ -26,6 +47,8 @@ class Row:
     """Cells by column."""
     remarks: list[str] = field(default_factory=list)
     """Comments above the row."""
+    cameras: list[str] = field(default_factory=list)
+    """Names of the cameras, as far as they are known."""
 
 
 @dataclass
@@ -38,6 +61,8 @@ class Draft:
     """The sequences."""
     subjects: dict[str, str] = field(default_factory=dict)
     """Gender by subject."""
+    subject_remarks: list[str] = field(default_factory=list)
+    """Comments of subjects.tsv."""
     objects: Path | dict[str, dict[str, Any]] = field(default_factory=dict)
     """An existing objects.yaml, or entries whose ``mesh`` and ``contact_vertices`` are paths."""
     annotations: dict[str, str] = field(default_factory=dict)
@@ -50,7 +75,7 @@ class Draft:
         of_rows = [
             f"{row.columns['sequence']}: {text}" for row in self.rows for text in row.remarks
         ]
-        return self.remarks + of_rows
+        return self.remarks + self.subject_remarks + of_rows
 
 
 def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
@@ -62,7 +87,7 @@ def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
     files = {
         "config.yaml": _config(draft, folder),
         "sequences.tsv": _sequences(draft.rows, folder),
-        "subjects.tsv": _table(("subject", "gender"), sorted(draft.subjects.items())),
+        "subjects.tsv": _subjects(draft),
     }
     if not isinstance(draft.objects, Path):
         files["objects.yaml"] = _objects(draft.objects, folder)
@@ -115,8 +140,11 @@ def _cell(value: str | Path, folder: Path) -> str:
     return text
 
 
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    return "\n".join(["\t".join(cells) for cells in [header, *rows]] + [""])
+def _subjects(draft: Draft) -> str:
+    lines = [f"# {remark}" for remark in draft.subject_remarks]
+    lines.append("subject\tgender\theight")
+    lines += [f"{name}\t{gender}\t" for name, gender in sorted(draft.subjects.items())]
+    return "\n".join([*lines, ""])
 
 
 def _objects(entries: dict[str, dict[str, Any]], folder: Path) -> str:

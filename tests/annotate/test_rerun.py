@@ -28,7 +28,7 @@ def project(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Proj
     shutil.copytree(made.parent, tmp_path / "project")
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "project" / "config.yaml"
-    path.write_text("dataset: trial\nresults: project/results\n")
+    path.write_text("dataset: trial\n")
     return load_project(path)
 
 

@@ -53,7 +53,7 @@ VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not No
 NOTHING = "(?!)"  # pattern without a match
 RESULTS = PROJECT.results.as_posix()
 LOGS = PROJECT.logs.as_posix()
-BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"
+BENCHMARKS = PROJECT.benchmarks.as_posix()
 ENVIRONMENT = "../../envs/intercap.yaml"
 MODEL_THREADS = 8
 

@@ -1,7 +1,7 @@
 """The recordings of an evaluation with new random seeds, for figures on unseen data.
 
 Other people act in the same scripts, with other motions, rooms and errors. Settings and tables are
-written to ``results/seed_<N>/settings``, results to ``results/seed_<N>``.
+written to ``results/seed_<N>/config``, results to ``results/seed_<N>``.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ def redraw_settings(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[s
 def _written(project: Project, seed: int) -> Path:
     """Write one project's settings and tables with new seeds and subjects; returns the settings."""
     root = project.config.results / f"seed_{seed}"
-    folder = root / "settings"
+    folder = root / "config"
     folder.mkdir(parents=True, exist_ok=True)
     people = _people(project, seed)
     values: dict[str, Any] = read_yaml(project.path)
     values |= {
-        "results": root.as_posix(),
+        "results": ".",
         "objects": os.path.abspath(project.path.parent / project.config.objects),
         "annotations": os.path.abspath(project.path.parent / project.config.annotations),
     }

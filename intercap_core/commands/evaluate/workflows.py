@@ -41,7 +41,7 @@ class Job(NamedTuple):
 
     def seconds(self) -> float:
         """Wall seconds of the last run, from the workflow's benchmark file; 0 if unknown."""
-        folder = Path("benchmarks") / self.project.config.dataset / self.sequence
+        folder = self.project.benchmarks / self.sequence
         try:
             with open(folder / f"{self.stage}.tsv", encoding="utf-8") as file:
                 return float(next(csv.DictReader(file, delimiter="\t"))["s"])
@@ -204,10 +204,12 @@ def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
     """Start a workflow on ``cores`` cores; ``lock`` is the file descriptor of the system lock."""
     project = run.project
     targets = [
-        str(project.artefact(name, stage)) for stage in run.stages for name in project.sequences
+        project.target(project.artefact(name, stage))
+        for stage in run.stages
+        for name in project.sequences
     ]
     run.watcher = Watcher(project, console)
-    command = snakemake_command(project.path, cores=cores, arguments=[*targets, "--nolock"])
+    command = snakemake_command(project, cores=cores, arguments=[*targets, "--nolock"])
     # the lock lasts as long as any of the processes
     run.process = run.watcher.start(command, pass_fds=[lock])
 

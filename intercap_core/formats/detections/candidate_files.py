@@ -75,6 +75,18 @@ def has_candidates(folder: Path, camera: str, layout: str) -> bool:
     return (folder / camera).is_dir() and bool(find_instance_masks(folder / camera))
 
 
+def holds_instances(folder: Path, camera: str, layout: str) -> bool:
+    """Whether the first file of a camera lists results of instance segmentation, or is a mask."""
+    path = camera_file(folder, camera) or next(iter(image_files(folder, camera)), None)
+    if path is None:
+        return has_candidates(folder, camera, layout)
+    try:
+        content = read_head(path)
+        return bool(parse_candidates(content, CandidateForm((1, 1), {}, 0.0)).entries)
+    except UnreadableDetections:
+        return False
+
+
 def read_camera(
     folder: Path,
     images: CameraImages,

@@ -85,7 +85,9 @@ class DetectionPreview:
     """The first keypoints or candidates of one camera."""
 
     notes: list[str] = field(default_factory=list)
-    """Messages for the user about faults."""
+    """Messages for the user about entries that are left out or changed."""
+    faults: list[str] = field(default_factory=list)
+    """Messages about files that the detections stage refuses."""
     labels: set[str] = field(default_factory=set)
     """Labels of the instances; empty for keypoints."""
     recognised: list[str] = field(default_factory=list)

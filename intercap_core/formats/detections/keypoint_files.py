@@ -425,6 +425,48 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
         reading.notes.append(f"no keypoint file for {missing} images")
 
 
+def _load_first(
+    folder: Path, camera: str, notes: list[str]
+) -> tuple[dict[Path, Any], KeypointReader] | None:
+    """Load the beginning of a camera's file, or some of its files of one image.
+
+    Returns the contents by path and the files' reader, or None without files. Files that cannot be
+    loaded are added to ``notes``.
+    """
+    whole = find_camera_file(folder, camera)
+    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
+    if whole is not None:
+        paths, reader = [whole[0]], whole[1]
+    elif single is not None:
+        files = sorted(single[0].values())
+        paths, reader = files[:: -(-len(files) // FILES_PREVIEWED)], single[1]
+    else:
+        return None
+    loaded: dict[Path, Any] = {}
+    for path in paths:
+        try:
+            content = read_head(path) if reader.load is read_json else reader.load(path)
+        except UnreadableDetections as error:
+            notes.append(f"{path} {error}")
+            continue
+        if content is not None:
+            loaded[path] = content
+    return loaded, reader
+
+
+def holds_people(folder: Path, camera: str) -> bool:
+    """Whether the first files of a camera hold keypoints of a person."""
+    loaded, reader = _load_first(folder, camera, []) or ({}, readers()[0])
+    one_image = find_camera_file(folder, camera) is None
+    for content in loaded.values():
+        try:
+            if read_people(content, reader.load, one_image=one_image).results:
+                return True
+        except UnreadableDetections:
+            continue
+    return False
+
+
 def preview_keypoints(
     folder: Path, images: CameraImages, *, full_confidence: float, layout: str | None = None
 ) -> DetectionPreview:
@@ -439,24 +481,13 @@ def preview_keypoints(
     preview = DetectionPreview()
     whole = find_camera_file(folder, images.name)
     single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
-    if whole is not None:
-        paths, reader = [whole[0]], whole[1]
-    elif single is not None:
-        files = sorted(single[0].values())
-        paths, reader = files[:: -(-len(files) // FILES_PREVIEWED)], single[1]
+    if whole is None and single is not None:
         _, remark = images.recognise_names(single[0])
         preview.recognised += [f"files {remark}"] if remark else []
-    else:
+    first = _load_first(folder, images.name, preview.notes)
+    if first is None:
         return preview
-    loaded: dict[Path, Any] = {}
-    for path in paths:
-        try:
-            content = read_head(path) if reader.load is read_json else reader.load(path)
-        except UnreadableDetections as error:
-            preview.notes.append(f"{path} {error}")
-            continue
-        if content is not None:
-            loaded[path] = content
+    loaded, reader = first
 
     def read_as(name: str | None) -> _Reading:
         reading = _Reading(images, name)
@@ -479,7 +510,7 @@ def preview_keypoints(
         reading = _recognise_layout(read_as(layout), read_as, folder)
         found = reading.finish(folder, images.name, full_confidence)
     except UserError as error:
-        preview.notes.append(str(error))
+        preview.faults.append(str(error))
         return preview
     preview.recognised += found.recognised
     where = next(iter(loaded), folder)

@@ -10,6 +10,7 @@ named k0, k1, ... and k1 is the master, to whose colour camera poses are related
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +49,7 @@ class BehaveLayout(RecordingLayout):
                 "t<seconds>, such as t0003.000; correct 'recordings' in the table of sequences"
             )
         self._images = {time_us: _images(path) for time_us, path in self._frames.items()}
-        self.names = sorted(
-            {name for images in self._images.values() for name, _ in images},
-            key=lambda name: int(name[1:]),
-        )
+        self.names = _cameras_of(self._images.values())
 
     def open(self, name: str) -> AlignedRecording:
         """Find the camera's files; raises UserError without colour images or a matching lens."""
@@ -95,6 +93,15 @@ def frame_folders(recordings: Path) -> dict[int, Path]:
             )
         folders[time_us] = path
     return dict(sorted(folders.items()))
+
+
+def find_cameras(recordings: Path) -> list[str]:
+    """Names of the cameras that have an image in ``recordings``; raises as frame_folders does."""
+    return _cameras_of(_images(path) for path in frame_folders(recordings).values())
+
+
+def _cameras_of(frames: Iterable[dict[tuple[str, str], Path]]) -> list[str]:
+    return sorted({name for images in frames for name, _ in images}, key=lambda name: int(name[1:]))
 
 
 def frame_rate(times_us: list[int]) -> float:

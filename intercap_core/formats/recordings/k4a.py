@@ -311,6 +311,28 @@ def _is_truncated(path: Path) -> bool:
     return end is None or size < end
 
 
+def find_cameras(recordings: Path) -> list[str]:
+    """Names of the cameras with a file in ``recordings``; [] if no file is one of a Kinect."""
+    files = _find_files(recordings)
+    return sorted({file.stem for file in files}) if any(map(_is_kinect_file, files)) else []
+
+
+def _find_files(recordings: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in recordings.iterdir()
+        if path.suffix.lower() == ".mkv" and not path.name.startswith(".")
+    )
+
+
+def _is_kinect_file(path: Path) -> bool:
+    try:
+        with KinectFile(path):
+            return True
+    except UserError:
+        return False
+
+
 class KinectLayout(RecordingLayout):
     """Files ``<camera>.mkv``, in capitals too.
 
@@ -321,14 +343,13 @@ class KinectLayout(RecordingLayout):
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
         self._paths: dict[str, Path] = {}
-        for file in sorted(sequence.recordings.iterdir()):
-            if file.suffix.lower() == ".mkv" and not file.name.startswith("."):
-                first = self._paths.setdefault(file.stem, file)
-                if first != file:
-                    raise UserError(
-                        f"{sequence.recordings}: camera {file.stem} is recorded as {first.name} "
-                        f"and {file.name}; keep one"
-                    )
+        for file in _find_files(sequence.recordings):
+            first = self._paths.setdefault(file.stem, file)
+            if first != file:
+                raise UserError(
+                    f"{sequence.recordings}: camera {file.stem} is recorded as {first.name} "
+                    f"and {file.name}; keep one"
+                )
         self.names = list(self._paths)
         path, scale = sequence.calibration, sequence.calibration_scale
         other = read_tool_calibration(path, RecordedCameras(self.names), scale)

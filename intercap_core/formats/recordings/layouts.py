@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from intercap_core.config_types import LayoutName
@@ -118,6 +119,29 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
             and (path.suffix.lower() not in _NO_RECORDINGS or path.stem.endswith("timestamps"))
         }
     )
+
+
+def recognise_recordings(folder: Path) -> tuple[LayoutName, list[str]] | None:
+    """The layout of the recordings in a folder, and the names of their cameras; None without any.
+
+    Folders of images and videos are recordings only if there are two of them or more.
+    """
+    from intercap_core.formats.recordings import behave, intercap, k4a, plain
+
+    finders: dict[LayoutName, Callable[[Path], list[str]]] = {
+        "intercap": lambda path: list(intercap.find_camera_folders(path)),
+        "behave": behave.find_cameras,
+        "k4a": k4a.find_cameras,
+        "plain": plain.find_cameras,
+    }
+    for layout, find_cameras in finders.items():
+        try:
+            cameras = find_cameras(folder)
+        except UserError:
+            continue
+        if len(cameras) > (1 if layout == "plain" else 0):
+            return layout, cameras
+    return None
 
 
 def open_layout(sequence: SequenceEntry) -> RecordingLayout:

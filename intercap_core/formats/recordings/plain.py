@@ -40,12 +40,8 @@ class PlainLayout(RecordingLayout):
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
-        below = sorted(sequence.recordings.iterdir())
-        folders = [_CameraFolder.of(path) for path in below if path.is_dir()]
-        self._folders = {f.path.name: f for f in folders if f.colour or f.depth}
-        self._videos = [p for p in below if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()]
-        recorded = sorted({*self._folders, *(path.stem for path in self._videos)})
-        self.names = [name for name in recorded if CAMERA_NAME.fullmatch(name)]
+        self._folders, self._videos = _find_recordings(sequence.recordings)
+        self.names = find_cameras(sequence.recordings)
         calibration = read_calibration(
             sequence.calibration,
             RecordedCameras(self.names, self._size_of),
@@ -123,6 +119,21 @@ class PlainLayout(RecordingLayout):
                 f"{name}/depth/ with 16-bit {', '.join(DEPTH_SUFFIXES)}"
             )
         return recording
+
+
+def find_cameras(recordings: Path) -> list[str]:
+    """Names of the cameras that have a folder of images or a video in ``recordings``."""
+    folders, videos = _find_recordings(recordings)
+    recorded = sorted({*folders, *(path.stem for path in videos)})
+    return [name for name in recorded if CAMERA_NAME.fullmatch(name)]
+
+
+def _find_recordings(recordings: Path) -> tuple[dict[str, _CameraFolder], list[Path]]:
+    """Folders with images by name, and videos."""
+    below = sorted(path for path in recordings.iterdir() if not path.name.startswith("."))
+    folders = [_CameraFolder.of(path) for path in below if path.is_dir()]
+    videos = [path for path in below if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
+    return {f.path.name: f for f in folders if f.colour or f.depth}, videos
 
 
 def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
