@@ -75,7 +75,8 @@ class Draft:
         of_rows = [
             f"{row.columns['sequence']}: {text}" for row in self.rows for text in row.remarks
         ]
-        return self.remarks + self.subject_remarks + of_rows
+        of_subjects = [f"subjects.tsv: {text}" for text in self.subject_remarks]
+        return self.remarks + of_subjects + of_rows
 
 
 def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:

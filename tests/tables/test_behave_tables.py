@@ -70,9 +70,7 @@ def set_gender(root: Path, sequence: str, gender: object) -> None:
 
 
 def write(*arguments: str):
-    return CliRunner().invoke(
-        app, ["tables", "behave", "BEHAVE", "--output", "config/behave", *arguments]
-    )
+    return CliRunner().invoke(app, ["init", "BEHAVE", "--output", "config/behave", *arguments])
 
 
 def test_the_project_written_is_ready_to_run(release):
@@ -129,9 +127,7 @@ def test_incomplete_sequences_are_left_out_with_a_remark(release):
 def test_options_of_other_layouts_are_refused(release):
     done = write("--meshes", "BEHAVE/objects")
     assert isinstance(done.exception, UserError) and "--meshes" in str(done.exception)
-    done = CliRunner().invoke(app, ["tables", "kinect", "BEHAVE", "--output", "x"])
-    assert done.exit_code == 2 and "'kinect' is not one of 'intercap'" in done.output
-    done = CliRunner().invoke(app, ["tables", "behave", "nowhere", "--output", "x"])
+    done = CliRunner().invoke(app, ["init", "nowhere", "--output", "x"])
     assert "no such folder" in str(done.exception)
     done = write("--dataset", "../x")
     assert "--dataset is '../x'" in str(done.exception)

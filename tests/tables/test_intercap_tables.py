@@ -95,7 +95,7 @@ def annotate(root: Path, name: str, *, contact: str | None, frame: int = 0) -> P
 
 
 def tables(*arguments: str):
-    return CliRunner().invoke(app, ["tables", "intercap", *arguments], catch_exceptions=True)
+    return CliRunner().invoke(app, ["init", *arguments], catch_exceptions=True)
 
 
 def write(*arguments: str) -> str:
@@ -152,8 +152,8 @@ def test_poses_are_left_out_without_the_releases_meshes(release):
     output = write()
     project = load_project(Path("config/intercap/config.yaml"))
     assert project.annotation("s01_o03_seg1").object_pose is None
-    assert project.objects["football"].mesh == Path("config/objects/03_football.ply")
-    assert "objects are those of config/objects.yaml" in output
+    assert project.objects["football"].mesh == ROOT / "config/objects/03_football.ply"
+    assert "not the release's own" in output
 
 
 def test_detections_are_found_by_usual_names(release, tmp_path):
@@ -220,7 +220,7 @@ def test_broken_annotations_are_left_out_with_a_remark(release, fault, words):
 @pytest.mark.parametrize(
     ("missing", "words"),
     [
-        ("RGBD_Images", "holds no RGBD_Images"),
+        ("RGBD_Images", "no recordings that are recognised"),
         ("Data", "--calibrations"),
         ("Data/calibration_third", "s03_o09_seg0 needs calibration_third"),
         ("objs/09.ply", "no such mesh of object 'cup'"),

@@ -1,0 +1,101 @@
+"""A project written for a folder of own recordings, which `check` then finds ready to run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from intercap_core.cli import app
+from intercap_core.project import Project, load_project
+from tests.helpers.plain_capture import CAMERAS, write_rig
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = (64, 48)
+PERSON = {"people": [{"pose_keypoints_2d": [10.0, 20.0, 0.9] * 25}]}
+INSTANCE = {"image_id": 0, "category_id": 47, "score": 0.9, "bbox": [1, 1, 9, 9],
+            "segmentation": [[1, 1, 9, 1, 9, 9, 1, 9]]}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two sequences with a common calibration; keypoints lie beside one, candidates apart."""
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "captures"
+    for name in ("s02_cup_drink", "walk"):
+        shots = root / name
+        shots.mkdir(parents=True)
+        images = write_rig(shots, SIZE, 60.0)
+        for camera, path in images.items():
+            for number in range(3):
+                picture = np.full((*SIZE[::-1], 3), 80, np.uint8)
+                cv2.imwrite(str(path / f"{number:03d}.jpg"), picture)
+            shutil.move(path, shots / camera)
+        (shots / "recordings").rmdir()
+    (root / "s02_cup_drink" / "rig.json").unlink()
+    (root / "walk" / "rig.json").rename(root / "rig.json")
+    for camera in CAMERAS:
+        people = root / "s02_cup_drink" / "openpose" / camera
+        people.mkdir(parents=True)
+        for number in range(3):
+            (people / f"{number:03d}_keypoints.json").write_text(json.dumps(PERSON))
+        results = root / "candidates" / "s02_cup_drink"
+        results.mkdir(parents=True, exist_ok=True)
+        (results / f"{camera}.json").write_text(json.dumps([INSTANCE]))
+    (root / "meshes").mkdir()
+    for number, name in ((1, "suitcase"), (9, "cup")):
+        mesh = f"{number:02d}_{name}.ply"
+        shutil.copy(ROOT / "config" / "objects" / mesh, root / "meshes" / mesh)
+    return root
+
+
+def init(*arguments: str) -> tuple[str, Project]:
+    done = CliRunner().invoke(app, ["init", "captures", "--output", "lab", *arguments])
+    assert done.exit_code == 0, done.exception or done.output
+    return done.output, load_project(Path("lab/config.yaml"))
+
+
+def test_what_can_be_seen_is_written(folder: Path) -> None:
+    output, project = init()
+    assert list(project.sequences) == ["s02_cup_drink", "walk"]
+    row, alone = project.sequences.values()
+    assert (row.layout, row.subject, row.object) == ("plain", "s02", "cup")
+    assert row.calibration == alone.calibration == Path("captures/rig.json")
+    assert row.keypoints == Path("captures/s02_cup_drink/openpose")
+    assert row.candidates == Path("captures/candidates/s02_cup_drink")
+    assert (alone.object, alone.keypoints, alone.candidates) == (None, None, None)
+    assert set(project.objects) == {"cup", "suitcase"}
+    assert "2 of 2 sequences are ready to run" in output
+
+
+def test_what_cannot_be_seen_is_marked_and_has_a_default(folder: Path) -> None:
+    output, project = init()
+    assert {row.gender for row in project.subjects.values()} == {"neutral"}
+    assert "FILL IN: gender" in Path("lab/subjects.tsv").read_text()
+    table = Path("lab/sequences.tsv").read_text().splitlines()
+    assert "FILL IN: the name of the sequence contains no object" in table[-2]
+    assert output.count("FILL IN") == 2
+
+
+def test_a_missing_calibration_is_marked(folder: Path) -> None:
+    (folder / "rig.json").unlink()
+    done = CliRunner().invoke(app, ["init", "captures", "--output", "lab"])
+    assert done.exit_code == 1 and done.exception is not None
+    assert done.output.count("FILL IN: no calibration of left, right is found") == 2
+    assert "0 of 2 sequences are ready to run" in done.output
+
+
+def test_the_project_can_lie_in_the_folder_of_the_recordings(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = CliRunner().invoke(app, ["init", "."])
+    assert done.exit_code == 0, done.output
+    assert load_project(Path("config.yaml")).results == Path("results/captures")
+    again = CliRunner().invoke(app, ["init", "."])
+    assert "exists already" in str(again.exception) and "--replace" in str(again.exception)
