@@ -23,6 +23,7 @@ from intercap_core.formats.recordings.extract import advice_on_size
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.layouts import list_unread, open_layout
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
+from intercap_core.geometry.camera.rig import Camera, Rig, count_facing_away
 from intercap_core.project import Project
 from intercap_core.schemas import TRUTH
 
@@ -280,10 +281,12 @@ def check_recordings(
     """
     settings = settings or DetectionsSettings()
     findings, recordings = RecordingFindings(), {}
+    posed: list[Camera] = []
     stems: dict[str, tuple[str, ...]] = {}
     for name in cameras:
         try:
             with layout.open(name) as recording:
+                posed.append(recording.camera)
                 lens, depth = recording.camera.colour, recording.camera.depth
                 recordings[name] = CheckedRecording(
                     recording.source,
@@ -321,6 +324,13 @@ def check_recordings(
             images = replace(images, first_number=settings.candidate_first_number)
             findings.compare_numbers("candidates", row.candidates, whole, files, images)
     findings.summary = _summary(row, recordings)
+    away = count_facing_away(Rig(tuple(posed))) if posed else 0
+    if 2 * away > len(posed):
+        findings.notes.append(
+            f"{row.calibration}: {away} of {len(posed)} cameras face away from the place where "
+            "their optical axes meet, so their poses likely have OpenGL's axes (y up, z "
+            "backwards); expected y down, z forward"
+        )
     if len(cameras) == len(recordings) == 1 and not recordings[cameras[0]].depth:
         findings.faults.append(
             f"{row.recordings}: only camera {cameras[0]} is used, and without depth; "

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
@@ -87,6 +88,19 @@ def test_colour_as_tiff_is_read(tmp_path):
         assert "3 colour images are TIFF" in opened.notes[0]
     assert difference(cv2.imdecode(np.frombuffer(images[1], np.uint8), 1), true) < 3
     assert any("images are 64x48" in fault for fault in check(project).faults)
+
+
+@pytest.mark.parametrize("opengl", [False, True])
+def test_poses_with_the_axes_of_opengl_are_noted(tmp_path, opengl):
+    """Of https://github.com/zju3dv/EasyMocap/issues/133."""
+    project = open_case("b14", tmp_path)
+    path = project.path.parent / "calibration.yaml"
+    calibration = yaml.safe_load(path.read_text())
+    flip = np.diag([1, -1, -1] if opengl else [1, 1, 1])
+    for camera in calibration["cameras"].values():
+        camera |= {key: (flip @ camera[key]).tolist() for key in "RT"}
+    path.write_text(yaml.safe_dump(calibration))
+    assert any("3 of 3 cameras face away" in note for note in check(project).notes) == opengl
 
 
 @pytest.mark.parametrize("unit", [0.001, 0.0002])

@@ -27,7 +27,7 @@ DEPTH_DELAY_US = 500
 
 
 def pose_of(index: int) -> np.ndarray:
-    turn = cv2.Rodrigues(np.array([0.0, 1.0 * index, 0.0]))[0]
+    turn = cv2.Rodrigues(np.array([0.0, -1.0 * index, 0.0]))[0]
     return rigid(turn, np.array([0.5 * index, 0.0, 0.1 * index]))
 
 

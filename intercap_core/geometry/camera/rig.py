@@ -174,3 +174,9 @@ def ring_centre(rig: Rig) -> np.ndarray:
     if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):  # nearly parallel; tuned on the studio
         return (centres + 2.0 * axes).mean(0)
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))
+
+
+def count_facing_away(rig: Rig) -> int:
+    """Number of cameras that have :func:`ring_centre` behind them."""
+    to_colour = rig.colour_from_master
+    return int((to_colour[:, 2, :3] @ ring_centre(rig) + to_colour[:, 2, 3] < 0).sum())
