@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from intercap_core import artefacts
 from intercap_core.annotate import document, objects, questions, rerun, result, snap
 from intercap_core.annotate.before import Backup
+from intercap_core.annotate.edits import list_edits
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotation import Annotation, ObjectPose
 from intercap_core.commands.check import fault_of_cameras
@@ -111,8 +112,12 @@ class Annotator:
         return {"annotation": annotation.digest, "result": self.opened(name).stamp()}
 
     def compare(self, name: str) -> dict[str, Any]:
-        """Compare the result with the one before the last run."""
-        return Backup(self.project, name).compare()
+        """Compare the result with the one before the last run, and with the annotation."""
+        comparison = Backup(self.project, name).compare()
+        with contextlib.suppress(UserError):  # an annotation with faults
+            annotation = self.project.annotation(name)
+            comparison["edits"] = list_edits(self.opened(name), annotation)
+        return comparison
 
     def questions(self, name: str) -> list[dict[str, Any]]:
         """Return open questions, those with the largest effect first."""

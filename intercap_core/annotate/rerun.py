@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shlex
 import subprocess
@@ -18,13 +19,14 @@ from intercap_core.annotate.before import Backup
 from intercap_core.annotation import Annotation
 from intercap_core.commands.run import ENDS_WITHIN_S, kill_with_children
 from intercap_core.errors import UserError
-from intercap_core.pipeline.job import last_words, read_state
+from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project
 from intercap_core.stage_list import LEAVES
 
 _PLANNING = threading.Lock()  # Python 3.11 fails if two threads parse source at a time
 _PATIENCE_S = 10.0  # added to the time in which `intercap run` ends in order
+_SEQUENCES = 20  # other sequences whose logs are read for a stage's expected duration
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,20 @@ def command(
     ]  # fmt: skip
 
 
+def expected_seconds(project: Project, sequence: str, stage: str) -> float | None:
+    """Return how long the last run of a stage took, from its log, or None if no log tells.
+
+    Without a duration for this sequence, the mean over at most ``_SEQUENCES`` others is returned.
+    """
+    others = itertools.islice(project.logs.glob(f"*/{stage}.log"), _SEQUENCES)
+    for logs in ([project.logs / sequence / f"{stage}.log"], others):
+        ends = [read_state(log) for log in logs if log.is_file()]
+        durations = [float(text.split()[0]) for state, text in ends if state == "finished"]
+        if durations:
+            return sum(durations) / len(durations)
+    return None
+
+
 class RunManager:
     """Runs that the page starts, one at a time."""
 
@@ -83,7 +99,8 @@ class RunManager:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._sequence = ""
-        self._stages: list[str] = []
+        self._expected: dict[str, float | None] = {}  # seconds by stage of the last run
+        self._begun: dict[str, float] = {}  # time at which each stage was first seen at work
         self._start = self._ended = 0.0
         self._stop_time = 0.0  # time.monotonic() of the request to stop, 0 = none
         self._output: Path | None = None
@@ -111,11 +128,13 @@ class RunManager:
                 raise UserError(
                     f"a run of {self._sequence} is in progress; wait for its end, or stop it"
                 )
-            self._stages = [stale["stage"] for stale in stale_stages(project, sequence)]
-            if not self._stages:
+            stages = [stale["stage"] for stale in stale_stages(project, sequence)]
+            if not stages:
                 raise UserError(f"nothing to run: all results of {sequence} are up to date")
             self._note_end(project)
-            Backup(project, sequence).make(self._stages)
+            self._expected = {stage: expected_seconds(project, sequence, stage) for stage in stages}
+            self._begun = {}
+            Backup(project, sequence).make(stages)
             self._output = project.logs / "annotate.txt"  # not .log, which jobs use
             self._output.parent.mkdir(parents=True, exist_ok=True)
             self._sequence, self._start, self._ended = sequence, time.time(), 0.0
@@ -148,12 +167,16 @@ class RunManager:
                 self._process.wait(ENDS_WITHIN_S + _PATIENCE_S)
 
     def progress(self, project: Project) -> dict[str, Any]:
-        """Return the state of the last run, with each stage's state and last line of its log."""
+        """Return the state of the last run and of each of its stages.
+
+        ``stages`` has, by stage: ``state``, ``message`` (duration, or reason of a failure), and
+        ``seconds`` and ``expected_s``, its time so far and in the run before, None = unknown.
+        """
         if self._process is None:
             return {"state": "none"}
         status = self._process.poll()
         self._note_end(project)
-        stages = [{"stage": stage, **self._stage(project, stage)} for stage in self._stages]
+        stages = [self._stage(project, stage) for stage in self._expected]
         stopping = bool(self._stop_time)
         if status is None:
             state = "ending" if stopping else "running"
@@ -177,12 +200,14 @@ class RunManager:
         if self._process.returncode == 0:
             Backup(project, self._sequence).mark_success()
 
-    def _stage(self, project: Project, stage: str) -> dict[str, str]:
+    def _stage(self, project: Project, stage: str) -> dict[str, Any]:
         log = project.logs / self._sequence / f"{stage}.log"
-        try:
+        state, message = "waits", ""
+        with contextlib.suppress(FileNotFoundError):
             if log.stat().st_mtime >= self._start - 1.0:  # some file systems store whole seconds
                 state, message = read_state(log)
-                return {"state": state, "message": message or last_words(log)}
-        except FileNotFoundError:
-            pass
-        return {"state": "waits", "message": ""}
+        seconds = 0.0
+        if state == "running":
+            seconds = round(time.time() - self._begun.setdefault(stage, time.time()), 1)
+        return {"stage": stage, "state": state, "message": message, "seconds": seconds,
+                "expected_s": self._expected[stage]}  # fmt: skip

@@ -68,8 +68,18 @@ def test_a_run_computes_one_sequence_and_reports_progress(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = project.logs / NAME / "frames.log"
+    for name, stage, seconds in (
+        (NAME, "frames", 2.5),
+        ("s02", "frames", 9.0),
+        ("s02", "joint", 20.0),
+        ("s03", "joint", 40.0),
+    ):
+        earlier = project.logs / name / f"{stage}.log"
+        earlier.parent.mkdir(parents=True, exist_ok=True)
+        earlier.write_text(f"12:00:00 finished in {seconds} s\n")
+        os.utime(earlier, (1e9, 1e9))
     script = (
-        f"import pathlib; log = pathlib.Path({str(log)!r}); log.parent.mkdir(parents=True);"
+        f"import pathlib; log = pathlib.Path({str(log)!r});"
         "log.write_text('12:00:00 finished in 1.5 s\\n')"
     )
     commands = _pretend(monkeypatch, script)
@@ -81,6 +91,8 @@ def test_a_run_computes_one_sequence_and_reports_progress(
     assert progress["state"] == "done" and progress["sequence"] == NAME
     states = {stage["stage"]: (stage["state"], stage["message"]) for stage in progress["stages"]}
     assert states["frames"] == ("finished", "1.5 s") and states["joint"] == ("waits", "")
+    expected = {stage["stage"]: stage["expected_s"] for stage in progress["stages"]}
+    assert (expected["frames"], expected["joint"], expected["scene"]) == (2.5, 30.0, None)
     assert commands[0][3:7] == ["run", str(project.path), "--cores", "2"]
     assert commands[0][-4:] == ["--", *rerun.targets(project, NAME)]
 

@@ -233,6 +233,7 @@ export class Saving {
     else parts.push(button("Run stale stages", () => this.start(), { class: "main" }));
     parts.push(button("What would run?", () => this.plan()));
     if (!run.cluster && run.command) parts.push(make("details", {}, make("summary", {}, "Command for a terminal"), command(run.command)));
+    if (this.comparison?.edits?.length) parts.push(...this.#editsPart());
     if (this.comparison?.exists) parts.push(...this.#comparisonPart());
     else if (!this.comparison) parts.push(button("Compare with the old result", () => this.compare()));
     return make("div", { class: "run" }, parts);
@@ -240,12 +241,23 @@ export class Saving {
 
   #runningPart(own) {
     const { run } = this, ending = run.state === "ending";
-    const stages = run.stages.map(({ stage, state, message }) => make("li", { data: { state } },
-      make("b", {}, readable(stage)), ` ${state === "waits" ? "" : state} `, make("span", { class: "dim" }, message)));
+    const stages = run.stages.map((stage) => make("li", { data: { state: stage.state } }, make("b", {}, readable(stage.stage)), ` ${stageText(stage)} `,
+      stage.state === "running" && stage.expected_s ? make("progress", { value: Math.min(stage.seconds, stage.expected_s), max: stage.expected_s, ariaLabel: `${stage.stage}, share of its expected duration` }) : null));
+    const state = own ? `Running for ${duration(run.seconds)}; ${remaining(run.stages)}.` : `A run of ${run.sequence} is in progress; ${remaining(run.stages)}.`;
     return [
-      make("p", {}, ending ? `Ending for ${run.ending_s.toFixed(0)} s; unfinished results are removed, which takes at most ${run.ends_within_s.toFixed(0)} s.` : own ? `Running, ${run.seconds.toFixed(0)} s` : `A run of ${run.sequence} is in progress.`),
+      make("p", {}, ending ? `Ending for ${run.ending_s.toFixed(0)} s; unfinished results are removed, which takes at most ${run.ends_within_s.toFixed(0)} s.` : state),
       make("ol", { class: "stages" }, stages),
       ending && run.ending_s <= run.ends_within_s ? null : button(ending ? "Kill" : "Stop", () => this.stop())];
+  }
+
+  /* Each entry of the annotation beside the result, those that differ first. */
+  #editsPart() {
+    const { edits } = this.comparison, differ = edits.filter(({ same }) => !same).length;
+    return [make("h3", {}, differ ? `The result differs from ${differ} of ${edits.length} entries of the annotation` : `The result agrees with all ${edits.length} entries of the annotation`),
+      make("table", { class: "edits" }, make("tr", {}, ["annotated", "result"].map((text) => make("th", {}, text))),
+        edits.map(({ frame, annotated, result, same, why }) => make("tr", { class: same ? "" : "differs" },
+          make("td", {}, button(annotated, () => this.app.show(frame), { class: "plain" })),
+          make("td", {}, result, why ? make("div", { class: "dim" }, why) : null))))];
   }
 
   #comparisonPart() {
@@ -254,12 +266,30 @@ export class Saving {
     const show = (value) => (value === null || value === undefined ? "–" : String(value));
     const moved = (name, mm) => (mm ? make("p", { class: "dim" }, `${name} moved by at most ${Math.max(...mm).toFixed(1)} mm, in frame ${mm.indexOf(Math.max(...mm))}.`) : null);
     return [
+      make("h3", {}, "Old and new result"),
       make("p", { class: "dim", data: { part: "before" } }, `Old: the result of ${when(made_at)}, kept before the run of ${when(kept_at)}`,
         unfinished ? ". That run did not succeed: the next one keeps this old result." : "."),
       make("table", { class: "comparison" }, make("tr", {}, make("th", {}, "figure"), make("th", {}, "old"), make("th", {}, "new")),
         rows.map((row) => make("tr", { class: row.old === row.new ? "" : "differs" }, make("td", {}, row.name), make("td", {}, show(row.old)), make("td", {}, show(row.new))))),
       moved("The body", body_moved_mm), moved("The object", object_moved_mm)];
   }
+}
+
+const duration = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
+
+function stageText({ state, message, seconds, expected_s }) {
+  const about = expected_s ? `about ${duration(expected_s)}` : "";
+  if (state === "running") return `${duration(seconds)}${about ? ` of ${about}` : ""}`;
+  return { waits: about, finished: `done in ${message}`, failed: `failed: ${message}` }[state];
+}
+
+/* Remaining time of a run: the sum over its stages, as long as the last run of each one took. */
+function remaining(stages) {
+  const open = stages.filter(({ state }) => ["running", "waits"].includes(state));
+  const unknown = open.filter(({ expected_s }) => !expected_s).map(({ stage }) => readable(stage));
+  const seconds = open.reduce((sum, stage) => sum + Math.max(0, (stage.expected_s ?? 0) - stage.seconds), 0);
+  const known = unknown.length < open.length ? `about ${duration(seconds)} left` : "remaining time unknown";
+  return unknown.length && unknown.length < open.length ? `${known}, without ${unknown.join(", ")}` : known;
 }
 
 /* Lines that only one of two texts contains, as a diff. */

@@ -71,6 +71,7 @@ def test_a_stopped_run_is_shown_as_ending(settings: Path, monkeypatch: pytest.Mo
         hand.page.locator("#tab-run").click()
         hand.click("Run stale stages")
         hand.wait("window.annotate.saving.run.state === 'running'")
+        assert "remaining time unknown" in hand.text("#panels")
         hand.page.wait_for_timeout(700)  # until the process handles signals
         hand.click("Stop")
         hand.wait("document.getElementById('panels').textContent.includes('Ending for')")
