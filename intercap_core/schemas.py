@@ -218,7 +218,7 @@ OBJECT_TRACK = Schema(
         "overlap": Field(("T", "C"), "float32", "IoU of the used candidate and the visible part of the rendered object; NaN = none"),
         "depth_residual": Field(("T", "C"), "float32", "median absolute depth residual; NaN = none", "m"),
         "silhouette_residual": Field(("T", "C"), "float32", "median contour distance; NaN = none", "px"),
-        "views": Field(("T",), "int8", "number of views that determine the pose"),
+        "views": Field(("T",), "int8", "number of views whose images are evidence for the pose"),
         "covariance": Field(("T", "6", "6"), "float64", "covariance of (rotation vector, translation), rotation applied on the left", "rad, m", "master"),
         "spread": Field(("T", "6", "6"), "float64", "part of covariance that comes from rival hypotheses; covariance - spread is that of the images near this pose", "rad, m", "master"),
         "lost": Field(("T",), "bool", "the tracker rejects the pose"),

@@ -20,7 +20,7 @@ from intercap_core.object_track.view_fit import (
     ViewFit,
     shots_of,
 )
-from intercap_core.object_track.view_report import ViewReport, quick_report
+from intercap_core.object_track.view_report import ViewReport, choose_candidate, report_view
 
 # Geman-McClure scales, first and last, like those of contours: from the error of a start to a few
 # standard deviations of the noise.
@@ -69,14 +69,8 @@ class FittedPose:
 
     @property
     def support(self) -> int:
-        """Number of views that support the pose.
-
-        These have a candidate, or 36 visible pixels and a mean agreement of depth above 0.5.
-        """
-        return sum(
-            not np.isnan(view.overlap) or (view.visible_px >= 36 and view.depth_agreement > 0.5)
-            for view in self.views
-        )
+        """Number of views whose images are evidence for the pose."""
+        return sum(view.log_ratio > 0 for view in self.views)
 
 
 def fit_pose(
@@ -207,9 +201,9 @@ def assess_all(
 
     def compare(number: int) -> ViewReport:
         silhouette, *depth = drawn[number]
-        return quick_report(
-            context, each[number], seen[number], silhouette, depth[0] if depth else None
-        )
+        view, own = each[number], seen[number]
+        candidate = choose_candidate(view, silhouette, context.labels)
+        return report_view(context, view, own, silhouette, depth[0] if depth else None, candidate)
 
     reports = context.renderer.pool.map(compare, range(len(each)))
     unknown = np.full((6, 6), np.nan)

@@ -102,42 +102,6 @@ def matches(rendered, face, shift, measured, points, face_normals, rotation, eye
 
 
 @numba.njit(cache=True, nogil=True)
-def agreement(rendered, face, x0, y0, measured, rays, face_normals, rotation, free_m, scale):
-    """Compare a rendering with the whole depth image.
-
-    The agreement of a pixel is scale^2 / (scale^2 + r^2), from 0 to 1; r is the point-to-plane
-    distance in metres.
-
-    Args:
-        rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.
-        measured: (H, W) depth in metres, 0 where invalid.
-        rays: (H, W, 2) of the depth lens.
-        face_normals: (F, 3) unit normals, object frame.
-        rotation: (3, 3) depth camera_from_object.
-        free_m: a pixel measured nearer than the rendering by more than this is occluded, metres.
-        scale: distance at which a pixel agrees by half, metres.
-
-    Returns:
-        Pixels compared, pixels not occluded, and the sum of the agreement of the latter.
-    """
-    compared, free, total = 0, 0, 0.0
-    for v in range(rendered.shape[0]):
-        for u in range(rendered.shape[1]):
-            f = face[v, u]
-            depth = measured[y0 + v, x0 + u]
-            if f < 0 or depth <= 0:
-                continue
-            compared += 1
-            gap = np.float64(depth) - rendered[v, u]
-            if gap > -free_m:
-                free += 1
-                nx, ny, nz = rotated_normal(face_normals, f, rotation)
-                r = gap * (nx * rays[y0 + v, x0 + u, 0] + ny * rays[y0 + v, x0 + u, 1] + nz)
-                total += scale * scale / (scale * scale + r * r)
-    return compared, free, total
-
-
-@numba.njit(cache=True, nogil=True)
 def add_row(hessian, gradient, row, residual, weight):
     """Add a weighted row (6,) of the Jacobian to J'WJ (6, 6) and J'Wr (6,)."""
     for i in range(6):

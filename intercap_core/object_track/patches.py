@@ -37,8 +37,6 @@ class DepthPatch:
     """(h, w, 3) float32, master frame."""
     trust: np.ndarray
     """(h, w) weight: 1 inside the candidate, 0 on a person, else ``OUTSIDE_MASK_WEIGHT``."""
-    on_person: np.ndarray
-    """(h, w) bool, pixels on a person."""
 
     @classmethod
     def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> DepthPatch | None:
@@ -58,12 +56,12 @@ class DepthPatch:
         colour_from_depth = geometry.camera.colour_from_depth
         assert colour_from_depth is not None
         person = view.person
-        depth, points, trust, on_person = _lift(
+        depth, points, trust = _lift(
             view.depth, lens.rays, left, top, right, bottom, np.asarray(colour_from_depth),
             geometry.camera.master_from_depth, geometry.lens.parameters,
             mask.mask, mask.x0, mask.y0, person.mask, person.x0, person.y0,
         )  # fmt: skip
-        return cls(left, top, depth, points, trust, on_person)
+        return cls(left, top, depth, points, trust)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +146,7 @@ def _lift(
     image, rays, left, top, right, bottom, colour_from_depth, master_from_depth, colour,
     mask, mx, my, person, px, py,
 ):  # fmt: skip
-    """Compute depth, points, trust and on_person of a :class:`DepthPatch`.
+    """Compute depth, points and trust of a :class:`DepthPatch`.
 
     The window of ``image`` includes left and top, but not right and bottom. Each pixel is lifted
     along its ray and projected into the colour image, whose masks decide its weight. Masks
@@ -159,7 +157,6 @@ def _lift(
     depth = np.zeros((height, width), np.float32)
     points = np.zeros((height, width, 3), np.float32)
     trust = np.full((height, width), np.float32(OUTSIDE_MASK_WEIGHT), np.float32)
-    on_person = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
             z = np.float64(image[top + v, left + u])
@@ -177,5 +174,4 @@ def _lift(
                 trust[v, u] = 1.0
             elif covers(person, i - px, j - py):
                 trust[v, u] = 0.0
-                on_person[v, u] = True
-    return depth, points, trust, on_person
+    return depth, points, trust

@@ -14,6 +14,8 @@ Residuals are in :mod:`.object_depth` and :mod:`.object_silhouette`.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from intercap_core.geometry.rigid.shots import Rendering, Shot
@@ -22,7 +24,6 @@ from intercap_core.object_track.likelihood import (
     CONTOUR_SIGMA_PX,
     DEPTH_HALF_SAMPLES_PX,
     VIEW_SAMPLES,
-    log_ratio,
 )
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
@@ -32,10 +33,8 @@ from intercap_core.object_track.view_report import (
     MIN_RENDERED_PX,
     ViewReport,
     choose_candidate,
-    count_unoccluded,
-    depth_agreement,
     mask_overlap,
-    visible_pixels,
+    report_view,
 )
 
 CONTOUR_SAMPLES = 3.0  # independent samples of a view's silhouette term; tuned
@@ -178,31 +177,26 @@ class ViewFit:
 
     def report(self) -> ViewReport:
         """Compare the current renderings with the view."""
-        view, image = self._view, self._silhouette
-        overlap = contour = float("nan")
+        report = report_view(
+            self._context, self._view, self._pose, self._silhouette, self._drawn_depth,
+            self._candidate,
+        )  # fmt: skip
+        contour = depth = float("nan")
         if self._candidate is not None:
-            overlap = mask_overlap(image, self._candidate.mask, view.person)
             # four times the last scale of a fit, so that outliers count
             _, _, residuals = self.contour_terms(4 * CONTOUR_SCALES_PX[1], True)
-            contour = float(np.median(residuals)) * view.geometry.step if len(residuals) else 0.0
-        visible = visible_pixels(image, view.person)
-        depth_residual = agreement = float("nan")
+            step = self._view.geometry.step
+            contour = float(np.median(residuals)) * step if len(residuals) else 0.0
         patch, drawn = self._depth_patch, self._drawn_depth
         if patch is not None and drawn is not None:
             gap, across, where = object_depth.matches(
                 drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
                 patch.depth, patch.points, self._context.mesh.face_normals,
-                self._pose[:3, :3], view.geometry.camera.master_from_depth[:3, 3],
+                self._pose[:3, :3], self._view.geometry.camera.master_from_depth[:3, 3],
             )  # fmt: skip
             column, row = where.T
             # in metres; pixels whose depth differs by more show something else
             own = (patch.trust[row, column] == 1.0) & (np.abs(gap) < 0.1)
             if own.sum() >= MIN_RENDERED_PX:
-                depth_residual = float(np.median(across[own]))
-            agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
-            visible = count_unoccluded(image, visible, free, len(gap))
-        number = self._candidate.index if self._candidate is not None else -1
-        ratio = log_ratio(
-            self._context, view, self._pose, image, self._drawn_depth, self._candidate, visible
-        )
-        return ViewReport(number, overlap, depth_residual, contour, visible, agreement, ratio)
+                depth = float(np.median(across[own]))
+        return replace(report, depth_residual_m=depth, contour_residual_px=contour)

@@ -1,4 +1,4 @@
-"""Agreement of a view with a pose: overlap of the masks, and depth of unoccluded pixels.
+"""Agreement of a view with a pose: overlap of the masks, and pixels that nothing occludes.
 
 The candidate that shows the object is the one that overlaps the rendered object most, as in the
 paper (render-compare-and-preserve).
@@ -12,7 +12,6 @@ import numba
 import numpy as np
 
 from intercap_core.geometry.rigid.shots import Rendering
-from intercap_core.object_track import object_depth
 from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
@@ -21,7 +20,6 @@ MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
 # Depth that differs from the render by more than this shows the background (farther) or an occluder
 # (nearer). The value is above the systematic errors of sensor and pose.
 FREE_SPACE_M = 0.03  # metres; tuned
-AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half (Azure Kinect's data sheet)
 
 
 def choose_candidate(
@@ -96,82 +94,47 @@ class ViewReport:
     """Index of the chosen candidate, -1 = none."""
     overlap: float
     """IoU of candidate and visible render; NaN without a candidate."""
-    depth_residual_m: float
-    """Median point-to-plane distance, metres."""
-    contour_residual_px: float
-    """Median contour distance, pixels at full resolution."""
     visible_px: int
     """Rendered pixels that are not occluded."""
-    depth_agreement: float
-    """Agreement of the unoccluded depth, 0 to 1; NaN without depth."""
     log_ratio: float = 0.0
     """Log-likelihood ratio, nats (:mod:`.likelihood`)."""
+    depth_residual_m: float = float("nan")
+    """Median point-to-plane distance, metres."""
+    contour_residual_px: float = float("nan")
+    """Median contour distance, pixels at full resolution."""
 
 
-def quick_report(
+def report_view(
     context: FitContext,
     view: View,
     pose: np.ndarray,
     silhouette: Rendering,
     drawn_depth: Rendering | None,
+    candidate: MaskCandidate | None,
 ) -> ViewReport:
-    """Compare the renderings of a pose (4, 4) with a view, without correspondences.
+    """Compare the renderings of a pose (4, 4) with a view and its chosen candidate.
 
     ``drawn_depth`` is None without depth.
     """
-    candidate = choose_candidate(view, silhouette, context.labels)
-    overlap = mask_overlap(silhouette, candidate.mask, view.person) if candidate else float("nan")
-    visible = visible_pixels(silhouette, view.person)
-    agreement = float("nan")
-    geometry = view.geometry
-    if view.depth is not None and drawn_depth is not None and geometry.depth_lens is not None:
-        compared, free, total = object_depth.agreement(
-            drawn_depth.depth, drawn_depth.face, drawn_depth.x0, drawn_depth.y0,
-            view.depth, geometry.depth_lens.rays, context.mesh.face_normals,
-            geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
-            FREE_SPACE_M, AGREEMENT_SCALE_M,
-        )  # fmt: skip
-        if free >= MIN_RENDERED_PX:
-            agreement = total / free
-        visible = count_unoccluded(silhouette, visible, free, compared)
-    number = candidate.index if candidate else -1
-    nothing = float("nan")
+    visible = _count_unoccluded(view, silhouette, drawn_depth)
     ratio = log_ratio(context, view, pose, silhouette, drawn_depth, candidate, visible)
-    return ViewReport(number, overlap, nothing, nothing, visible, agreement, ratio)
+    if candidate is None:
+        return ViewReport(-1, float("nan"), visible, ratio)
+    overlap = mask_overlap(silhouette, candidate.mask, view.person)
+    return ViewReport(candidate.index, overlap, visible, ratio)
 
 
-def depth_agreement(
-    gap: np.ndarray, across: np.ndarray, on_person: np.ndarray
-) -> tuple[float, int]:
-    """Compare measured depth with the render in pixels that nothing in front occludes.
-
-    Args:
-        gap: (N,) measured minus rendered depth, metres.
-        across: (N,) point-to-plane distance, metres.
-        on_person: (N,) pixels on a person, which do not count.
-
-    Returns:
-        Mean agreement (NaN if too few pixels) and the number of pixels without an occluder.
-    """
-    free = ~on_person & (gap > -FREE_SPACE_M)
-    count = int(free.sum())
-    if count < MIN_RENDERED_PX:
-        return float("nan"), count
-    scale = AGREEMENT_SCALE_M**2
-    return float((scale / (scale + across[free] ** 2)).mean()), count
-
-
-def count_unoccluded(silhouette: Rendering, visible: int, free: int, compared: int) -> int:
-    """Estimate the pixels of a silhouette that are not occluded.
-
-    Args:
-        silhouette: rendering in the colour image.
-        visible: pixels that no person's mask covers.
-        free: rendered pixels of the depth image that nothing nearer occludes.
-        compared: rendered pixels of the depth image that have a measurement.
-    """
-    if compared <= MIN_RENDERED_PX:
+def _count_unoccluded(view: View, silhouette: Rendering, drawn_depth: Rendering | None) -> int:
+    """Estimate the pixels of a silhouette that neither a person nor anything nearer occludes."""
+    visible = visible_pixels(silhouette, view.person)
+    if drawn_depth is None or view.depth is None:
         return visible
-    if free < MIN_RENDERED_PX:
+    measured = view.depth[drawn_depth.window]
+    compared = drawn_depth.mask & (measured > 0)
+    free = compared & (measured > drawn_depth.depth - FREE_SPACE_M)
+    compared_px, free_px = np.count_nonzero(compared), np.count_nonzero(free)
+    if compared_px <= MIN_RENDERED_PX:
+        return visible
+    if free_px < MIN_RENDERED_PX:
         return 0
-    return min(visible, round(int(silhouette.mask.sum()) * free / compared))
+    return min(visible, round(silhouette.area * free_px / compared_px))

@@ -116,7 +116,7 @@ def test_uncertain_carried_frames_are_ambiguous_first(
 
 
 def test_single_views_next_to_unseen_frames_are_flagged():
-    report = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
+    report = ViewReport(0, 0.9, 500)
     ratios = [(9, 9), (9, 0), (0, 0), (9, 9), (0, 9), (9, 0), (9, -2), (0, 0), (5, -1)]
     fits = [
         FittedPose(at(), np.eye(6), tuple(replace(report, log_ratio=float(nats)) for nats in both))

@@ -38,7 +38,7 @@ from tests.object_track.scenes import (
 
 SHARE = 0.25
 HANDLED, APART, AWAY = (np.array(p) for p in ([0.0, 0, 2], [1.2, 0, 2.5], [-1.5, 0, 2]))
-REPORT = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
+REPORT = ViewReport(0, 0.9, 500)
 
 
 @pytest.fixture(scope="module")

@@ -227,20 +227,3 @@ def test_rim_points_are_kept_before_measured_background(renders):
         (0, 0), 0.03,
     )  # fmt: skip
     np.testing.assert_array_equal(clear, at[:, 0] % 4 != 1)
-
-
-def test_agreement_equals_that_of_the_matches(renders):
-    mesh, image, other = renders
-    measured, points = _measurements(other)
-    pose = _pose()
-    compared, free, total = object_depth.agreement(
-        image.depth, image.face, image.x0, image.y0, measured, LENS.rays, mesh.face_normals,
-        pose[:3, :3], 0.03, 0.01,
-    )  # fmt: skip
-    in_master = MASTER @ pose
-    gap, across, _ = object_depth.matches(
-        image.depth, image.face, (image.x0, image.y0), measured, points, mesh.face_normals,
-        in_master[:3, :3], MASTER[:3, 3],
-    )  # fmt: skip
-    assert (compared, free) == (len(gap), (gap > -0.03).sum())
-    assert total == pytest.approx((1e-4 / (1e-4 + across[gap > -0.03] ** 2)).sum(), rel=1e-4)
