@@ -20,9 +20,9 @@ import numba
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import Paint
+from intercap_core.object_track.likelihood import VIEW_SAMPLES
 from intercap_core.object_track.reduced_mask import covers
 
-COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
 # Lower limits of the standard deviations of measured colours (brightness, two ratios) in logarithms
 # of light: shadows and lamps change the brightness more than the two ratios. They apply
 # where the frames vary less than the true noise, as for an object at rest.
@@ -193,9 +193,9 @@ class Appearance:
         starts = np.flatnonzero(np.diff(seen.view, prepend=-1))
         for start, stop in zip(starts, [*starts[1:], len(seen.view)], strict=True):
             own = slice(start, stop)
-            # Errors of a view's patches are correlated: all its pixels count as COLOUR_SAMPLES
+            # Errors of a view's patches are correlated: all its pixels count as VIEW_SAMPLES
             # samples. With more, the colour of a view of one side would be taken for exposure.
-            weight = COLOUR_SAMPLES * seen.pixels[own, None] / seen.pixels[own].sum()
+            weight = VIEW_SAMPLES * seen.pixels[own, None] / seen.pixels[own].sum()
             light = np.concatenate(
                 [np.full((stop - start, 1), exposure_sigma), shading_sigma * seen.normal[own]], 1
             )
@@ -224,7 +224,7 @@ class Appearance:
         for camera in np.unique(seen.view):
             here = seen.view == camera
             pixels = float(seen.pixels[here].sum())
-            samples = COLOUR_SAMPLES * pixels / (pixels + 60)  # half of them at 60 pixels
+            samples = VIEW_SAMPLES * pixels / (pixels + 60)  # half of them at 60 pixels
             total += samples * float(seen.pixels[here] @ ratio[here]) / pixels
         return total
 

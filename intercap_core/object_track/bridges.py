@@ -17,10 +17,7 @@ from intercap_core.geometry.camera.transforms import apply_step, rigid, step_bet
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.decoder import (
-    FIRST_HAND,
-    HELD_M,
     HELD_M_S,
-    HELD_RAD,
     HELD_RAD_S,
     mode_log_ratios,
     pose_distances,
@@ -30,10 +27,7 @@ from intercap_core.object_track.given_poses import UNSEEN_S
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
 from intercap_core.object_track.motion import estimate_hand_motions, unwrap_symmetry
 from intercap_core.object_track.observer import Observer
-
-# A pose with a larger standard deviation is lost; poses that are farther apart are different.
-UNSURE_M = 0.035  # metres; tuned on the studio
-UNSURE_RAD = np.radians(15)  # radians; tuned on the studio
+from intercap_core.object_track.turns import SAME_POSE_M, SAME_POSE_RAD, UNSURE_M, UNSURE_RAD
 
 
 @dataclass(frozen=True)
@@ -81,12 +75,12 @@ class Gap:
         frames = np.arange(a + 1, b)
         hands = [] if self.joints is None else estimate_hand_motions(self.joints[[a, b]])
         modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
-        ratio = modes[:, 0, 0]  # (M,) of rest, free motion and each hand
+        rest, free, *in_hand = modes[:, 0, 0]
         end = same(self.poses[b], self.poses[a])
         direct = self._straight(end)
         nothing = np.zeros((len(frames), 6, 6))
-        result = [Bridge(frames, direct, end, float(ratio[:FIRST_HAND].max()), nothing)]
-        for number, (hand, own) in enumerate(zip(hands, ratio[FIRST_HAND:], strict=True)):
+        result = [Bridge(frames, direct, end, float(max(rest, free)), nothing)]
+        for number, (hand, own) in enumerate(zip(hands, in_hand, strict=True)):
             if hand is None or not np.isfinite(own):
                 continue
             end = same(self.poses[b], hand.carry(self.poses[a]))
@@ -131,7 +125,8 @@ class Gap:
         nearer = min(
             self.times[t] - self.times[self.before], self.times[self.after] - self.times[t]
         )
-        turn, shift = np.hypot(HELD_RAD, HELD_RAD_S * nearer), np.hypot(HELD_M, HELD_M_S * nearer)
+        turn = np.hypot(SAME_POSE_RAD, HELD_RAD_S * nearer)
+        shift = np.hypot(SAME_POSE_M, HELD_M_S * nearer)
         return np.diag(np.repeat([turn, shift], 3) ** -2.0)
 
 

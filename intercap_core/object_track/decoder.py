@@ -19,24 +19,18 @@ from scipy.special import logsumexp
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.motion import HandMotion
+from intercap_core.object_track.turns import SAME_POSE_M, SAME_POSE_RAD
 
-# Standard deviations of the motion between frames.
-STANDING_M = 0.015  # shift at rest: errors of fits, metres; tuned
-# Turn at rest, radians; tuned. Half or double of it changes the probabilities of hypotheses in
-# cup_drink_s02 of the demo by 0.1 to 0.2.
-STANDING_RAD = np.radians(8)
-HELD_M = 0.02  # shift in a hand: errors of fits and joints, metres; tuned
-HELD_RAD = np.radians(10)  # turn in a hand, radians; tuned
-HELD_M_S = 0.3  # speed of slipping in a hand, m/s; tuned
+# Standard deviations of the motion of an object in a hand.
+HELD_M_S = 0.3  # speed of slipping, m/s; tuned
 HELD_RAD_S = 1.0  # the same of turns, rad/s; tuned
 # Costs are minus log-likelihoods, nats.
 FREE_COST_S = 30.0  # of free motion, nats/s: rest and hands explain most recordings; tuned
 MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second; tuned
 JUMP_COST = 10.0  # of a step that no motion explains, nats; tuned
-VANISH_COST = 7.0  # of going out of sight, and of coming into sight, nats; tuned
-LEAVE_COST = 4.0  # of leaving the room or coming back, in addition, nats; tuned
+# Of going out of sight or coming into sight, and in addition of leaving the room or coming back.
+VANISH_COST = 7.0  # nats; tuned
 
-FIRST_HAND = 2  # first mode that is a hand, after rest and free motion
 HIDDEN = -1  # index in paths: no hypothesis is true
 
 
@@ -64,7 +58,7 @@ def step_log_ratios(
             state before and the state after. The M = 2 + H modes are rest, free motion and each
             hand. The last state of either frame is that no hypothesis is true.
     """
-    modes = FIRST_HAND + len(hands)
+    modes = 2 + len(hands)  # rest, free motion, and each hand
     steps = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
     steps[..., :-1, -1] = steps[..., -1, :-1] = -VANISH_COST
     if not (len(before) and len(after)):
@@ -96,7 +90,7 @@ def mode_log_ratios(
     moved = (turn / (rad_s * seconds)) ** 2 + (shift / (m_s * seconds)) ** 2
     # free motion costs for 0.1 s at most: in a longer gap the object may have rested
     ratios = [
-        -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
+        -0.5 * ((turn / SAME_POSE_RAD) ** 2 + (shift / SAME_POSE_M) ** 2),
         -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, 0.1),
         *(_hand_log_ratios(mesh, before, after, seconds, hand) for hand in hands),
     ]
@@ -111,10 +105,10 @@ def _hand_log_ratios(
         return np.full((len(before), len(after)), -np.inf)
     turn, shift = pose_distances(mesh, hand.carry(before), after)
     centres = np.array([mesh.centre_at(pose) for pose in before])
-    turn_sigma = np.hypot(HELD_RAD, HELD_RAD_S * seconds)
+    turn_sigma = np.hypot(SAME_POSE_RAD, HELD_RAD_S * seconds)
     # an error of the hand's turn moves a centre in proportion to its distance from the wrist
     arm = np.linalg.norm(centres - hand.start, axis=1)
-    shift_sigma = np.sqrt(HELD_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
+    shift_sigma = np.sqrt(SAME_POSE_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
     ratio = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)
     ratio[~hand.reaches(centres, mesh.diameter / 2)] = -np.inf
     return ratio
@@ -167,7 +161,7 @@ def decode(
     states = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
     states[0][:-2] -= np.log(modes)  # all modes are equally likely in the first frame
     for end in (0, -1):
-        states[end][-1] -= LEAVE_COST
+        states[end][-1] -= VANISH_COST
     transitions = [_transitions(step) for step in steps]
     path = np.array(_viterbi(states, transitions)) // modes
     path[path >= [len(own) for own in emissions]] = HIDDEN
@@ -193,8 +187,8 @@ def _transitions(step: np.ndarray) -> np.ndarray:
     # an object that reappears is in any mode with equal probability
     log[-2, :-2] = np.repeat(step[0, 0, -1, :-1], modes) - np.log(modes)
     log[-2, -2] = step[0, 0, -1, -1]
-    log[:-1, -1] = log[:-1, -2] - LEAVE_COST
-    log[-1, :-1] = log[-2, :-1] - LEAVE_COST
+    log[:-1, -1] = log[:-1, -2] - VANISH_COST
+    log[-1, :-1] = log[-2, :-1] - VANISH_COST
     log[-1, -1] = 0.0
     return log
 

@@ -20,7 +20,7 @@ from intercap_core.object_track.evidence import TURN_SCALE, FrameEvidence, steps
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.motion import GROWTH_LOST_M_S, GROWTH_LOST_RAD_S
-from intercap_core.object_track.turns import SAME_POSE_DEG, SAME_POSE_M
+from intercap_core.object_track.turns import SAME_POSE_M, SAME_POSE_RAD
 
 UNSEEN_S = 0.8  # time that an object is followed without being seen, seconds; tuned on the studio
 
@@ -50,8 +50,7 @@ class GivenPose:
         """
         turn, shift = self.distance(mesh, pose)
         return (
-            shift < 3.0 * self.sigma_m + SAME_POSE_M
-            and turn < 3.0 * self.sigma_rad + np.radians(SAME_POSE_DEG)
+            shift < 3.0 * self.sigma_m + SAME_POSE_M and turn < 3.0 * self.sigma_rad + SAME_POSE_RAD
         )
 
     def distance(self, mesh: ObjectMesh, pose: np.ndarray) -> tuple[float, float]:

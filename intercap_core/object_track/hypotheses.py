@@ -28,9 +28,8 @@ from intercap_core.object_track.motion import (
     unwrap_symmetry,
 )
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.turns import distinct_poses, same_pose
+from intercap_core.object_track.turns import UNSURE_M, UNSURE_RAD, distinct_poses, same_pose
 
-BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose; tuned
 # Largest number of hypotheses of a frame: enough for a mug turned in steps of 30 degrees. With 6,
 # the true turn of a mug was dropped.
 MAX_HYPOTHESES = 12  # tuned on the studio
@@ -165,7 +164,7 @@ class Hypotheses:
         """Return the hypothesis of frame t to drop: the least likely of the first of these groups.
 
         1. Hypotheses that the images do not support, if they support another one.
-        2. Hypotheses with a likelier one within 4 cm and 20 degrees.
+        2. Hypotheses with a likelier one within ``UNSURE_M`` and ``UNSURE_RAD``.
         3. All hypotheses.
         """
         own, mesh = self.fits[t], self._observer.mesh
@@ -173,7 +172,10 @@ class Hypotheses:
         if own[order[0]].log_ratio < SEEN_LOG_RATIO < own[order[-1]].log_ratio:
             return order[0]
         for i, k in enumerate(order):
-            if any(same_pose(mesh, own[k].pose, own[j].pose, (0.04, 20)) for j in order[i + 1 :]):
+            if any(
+                same_pose(mesh, own[k].pose, own[j].pose, (UNSURE_M, UNSURE_RAD))
+                for j in order[i + 1 :]
+            ):
                 return k
         return order[0]
 
@@ -258,7 +260,7 @@ class Hypotheses:
         (4, 4) are the last two poses, ``now`` in frame ``last``.
         """
         poses = np.array([extrapolate(before, now), now, *self._observer.carried(last, t, now)])
-        starts = poses[distinct_poses(self._observer.mesh, poses, BASIN)]
+        starts = poses[distinct_poses(self._observer.mesh, poses, (UNSURE_M, UNSURE_RAD))]
         if len(starts) == 1:
             return starts[0]
         rates = step_between(now, starts) / (self._times[t] - self._times[last])

@@ -32,7 +32,8 @@ SEARCH_GOOD_LOG_RATIO = 25.0  # good enough to stop searching the frame; tuned
 CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose; tuned
 CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution; tuned
 DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples; tuned
-VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most; tuned
+# Independent samples of a view's depth, outline or colours at most, since its pixels err together.
+VIEW_SAMPLES = 4.0  # tuned
 LOG_MISSED = float(np.log(0.1))  # how often detectors miss an object that is fully visible; tuned
 LABEL_LOG_RATIO = 1.0  # nats of a candidate with the object's label; minus this with another; tuned
 

@@ -14,11 +14,16 @@ from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, s
 from intercap_core.object_track.decoder import HIDDEN, Decoded
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.hypotheses import BASIN, RIVAL_LOG_RATIO, Hypotheses, Prior
+from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses, Prior
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.turns import distinct_poses, find_near_symmetries
+from intercap_core.object_track.turns import (
+    UNSURE_M,
+    UNSURE_RAD,
+    distinct_poses,
+    find_near_symmetries,
+)
 
 SEED_SURE_LOG_RATIO = 40.0  # a first frame with this weight ends the search, nats; tuned
 KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
@@ -203,7 +208,8 @@ class Proposals:
         assessed = self._observer.assess_all(t, starts, twists=rates)
         assessed.sort(key=lambda fit: -fit.log_ratio)
         mesh, fits = self._observer.mesh, []
-        for k in distinct_poses(mesh, [fit.pose for fit in assessed], BASIN, count=3):
+        poses = [fit.pose for fit in assessed]
+        for k in distinct_poses(mesh, poses, (UNSURE_M, UNSURE_RAD), count=3):
             fits.append(self._fit(t, assessed[k].pose, assessed[k].twist))
             if fits[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
                 break

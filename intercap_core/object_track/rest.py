@@ -18,9 +18,9 @@ from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 # Longest rest of the partition, half a minute at 30 Hz. It limits the run time, which grows with
 # the square of a rest's length; a minute at rest takes 1.5 times as long without it.
 MAX_REST_FRAMES = 900
-# Costs are minus log-likelihoods, nats; tuned on the studio.
-MOVING_COST = 9.0  # of each independent observation in motion, for the six numbers of a pose; tuned
-REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
+# Costs are minus log-likelihoods, nats.
+# Of the six numbers of a pose: of each independent observation in motion, and of one more rest.
+POSE_COST = 9.0  # tuned
 
 
 def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -69,9 +69,9 @@ def _partition(
     """Find the cheapest partition into rests and motions, by dynamic programming.
 
     ``best_rest[e]`` and ``best_move[e]`` are the costs of the cheapest partition of the frames
-    before e whose last frame rests or moves. A rest from a to e costs ``REST_COST`` and half of the
+    before e whose last frame rests or moves. A rest from a to e costs ``POSE_COST`` and half of the
     squared distances of its frames from their mean pose, weighted. A moving frame costs
-    ``MOVING_COST`` times ``share``. Between two rests at least one frame moves.
+    ``POSE_COST`` times ``share``. Between two rests at least one frame moves.
 
     The partition is traced back from the last frame: ``began[e]`` is the first frame of the rest
     before e, and ``rested_before[e]`` tells whether the frames before the moving frame e - 1 end
@@ -89,7 +89,7 @@ def _partition(
             freedom at rest, None without rest.
     """
     count = len(poses)
-    moving = np.where(seen, MOVING_COST, 1.0) * share  # a frame without evidence costs 1
+    moving = np.where(seen, POSE_COST, 1.0) * share  # a frame without evidence costs 1
     best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     best_rest[0] = best_move[0] = 0.0
     began = np.zeros(count + 1, int)
@@ -109,8 +109,8 @@ def _partition(
         # whole rest on, but at most the cost of a whole rest.
         length = ends - a
         cut = (a == 0) | (ends == count)
-        longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * 0.9
-        own = np.where(cut, np.minimum(5.0 + longer, REST_COST), REST_COST)
+        longer = np.maximum(length - shortest + 1, 0) * POSE_COST * share * 0.9
+        own = np.where(cut, np.minimum(5.0 + longer, POSE_COST), POSE_COST)
         cost = best_move[a] + own + 0.5 * weight * spread
         least = np.where(cut, (shortest + 1) // 2, shortest)
         better = (cost < best_rest[ends]) & (length >= least)
@@ -197,7 +197,7 @@ def _merge(
             both = np.concatenate([last, rest])
             spreads = [_spread(poses[i], information[i], seen[i]) for i in (both, last, rest)]
             apart = 0.5 * (spreads[0][-1] - spreads[1][-1] - spreads[2][-1])
-            if len(spreads[0]) == len(both) and apart < REST_COST:
+            if len(spreads[0]) == len(both) and apart < POSE_COST:
                 result[last[0] : rest[-1] + 1] = number
                 last = both
                 continue

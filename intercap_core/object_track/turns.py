@@ -17,9 +17,14 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
-# Poses within both distances are one hypothesis.
+# Largest differences between fits of one pose. They are also the standard deviations of the motion
+# of an object at rest, or in a hand whose joints are known.
 SAME_POSE_M = 0.02  # metres; tuned
-SAME_POSE_DEG = 12.0  # degrees; tuned
+SAME_POSE_RAD = np.radians(10)  # radians; tuned
+# A pose with a larger standard deviation is lost; poses that are farther apart are different. Fits
+# from all poses within these distances lead to one pose.
+UNSURE_M = 0.035  # metres; tuned on the studio
+UNSURE_RAD = np.radians(15)  # radians; tuned on the studio
 NEAR_TURN_CHANGED_SHARE = 0.3  # of the surface that near symmetries clearly displace; tuned
 
 
@@ -177,10 +182,10 @@ def same_pose(
     mesh: ObjectMesh,
     a: np.ndarray,
     b: np.ndarray,
-    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
+    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_RAD),
 ) -> bool:
-    """Return whether two poses (4, 4) are equal up to symmetry and ``limits`` (m, degrees)."""
-    angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
+    """Return whether two poses (4, 4) are equal up to symmetry and ``limits`` (m, rad)."""
+    angle = float(np.radians(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3])))
     shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
     return shift < limits[0] and angle < limits[1]
 
@@ -188,7 +193,7 @@ def same_pose(
 def distinct_poses(
     mesh: ObjectMesh,
     poses: Sequence[np.ndarray] | np.ndarray,
-    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
+    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_RAD),
     count: int | None = None,
 ) -> list[int]:
     """Return indices of the first ``count`` poses (4, 4) that differ from all returned before."""

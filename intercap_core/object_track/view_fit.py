@@ -5,7 +5,7 @@ independent pixels of a view. Squared residuals are divided by their variance, a
 term together count as a number of independent samples:
 
     lambda_depth = VIEW_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
-    lambda_segm = trust CONTOUR_SAMPLES / m / CONTOUR_SIGMA_PX^2
+    lambda_segm = trust VIEW_SAMPLES / m / CONTOUR_SIGMA_PX^2
 
 for each of n depth pixels and m contour pixels (of the mask's contour or of the render's rim,
 whichever has more). ``trust`` of a mask grows from 0.1 to 1 with its overlap with the render.
@@ -37,7 +37,6 @@ from intercap_core.object_track.view_report import (
     report_view,
 )
 
-CONTOUR_SAMPLES = 3.0  # independent samples of a view's silhouette term; tuned
 # Standard deviation of one view's depth: systematic error and calibration, not pixel noise. Azure
 # Kinect's data sheet states a systematic error below 11 mm + 0.1 % of the distance; half of that
 # bound is a guess of its standard deviation.
@@ -171,7 +170,7 @@ class ViewFit:
             geometry.camera.master_from_colour, self._pose[:3, 3], scale,
         )  # fmt: skip
         # normalised by the whole rim: a few pixels that are off weigh less than a whole rim
-        samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
+        samples = VIEW_SAMPLES / max(len(patch.contour), rim_size)
         weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
         return weight * hessian, weight * gradient, residuals
 

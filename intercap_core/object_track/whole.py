@@ -19,7 +19,7 @@ import numpy as np
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.object_track.bridges import UNSURE_M, UNSURE_RAD, FilledTrack, fill_lost
+from intercap_core.object_track.bridges import FilledTrack, fill_lost
 from intercap_core.object_track.decoder import pose_distances
 from intercap_core.object_track.evidence import (
     COMMON_ERROR_VARIANCE,
@@ -39,12 +39,12 @@ from intercap_core.object_track.given_poses import (
     flag_edges,
     seconds_since,
 )
-from intercap_core.object_track.hypotheses import BASIN
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import DENIED_LOG_RATIO
 from intercap_core.object_track.rest import find_rests
 from intercap_core.object_track.smooth import smooth
+from intercap_core.object_track.turns import UNSURE_M, UNSURE_RAD
 
 
 class FrameStatus(IntEnum):
@@ -293,7 +293,7 @@ class WholeTrack:
         turn, shift = np.array(pairs).reshape(-1, 2).T
         known = np.array([own is not None for own in evidence])
         # the final pose is far from the evaluated one: compare the images again
-        moved_off = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1]))) | hidden
+        moved_off = known & ((shift > UNSURE_M) | (turn > UNSURE_RAD)) | hidden
         result = []
         for t, (fit, own) in enumerate(zip(fits, evidence, strict=True)):
             views = own.reports if own else fit.views

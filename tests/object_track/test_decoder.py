@@ -12,15 +12,12 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.decoder import (
     FREE_COST_S,
-    HELD_M,
     HELD_M_S,
-    HELD_RAD,
     HELD_RAD_S,
     HIDDEN,
     JUMP_COST,
-    LEAVE_COST,
     MODE_CHANGES_S,
-    STANDING_M,
+    VANISH_COST,
     decode,
     mode_log_ratios,
     step_log_ratios,
@@ -28,6 +25,7 @@ from intercap_core.object_track.decoder import (
 from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.motion import HandMotion
 from intercap_core.object_track.tracker import ABSENT_LOG_RATIO
+from intercap_core.object_track.turns import SAME_POSE_M, SAME_POSE_RAD
 from tests.geometry.rigid.conftest import catalogue
 
 NO_HAND = [None, None]
@@ -62,13 +60,13 @@ def test_it_equals_the_sum_over_all_sequences(modes: int, counts: list[int]) -> 
             return 0.0
         at = [k if isinstance(k, int) else -1 for k, _ in (before, after)]
         between = (before[1], after[1]) if min(at) >= 0 else (0, 0)
-        log = steps[t][(*between, *at)] - LEAVE_COST * ("gone" in (before[0], after[0]))
+        log = steps[t][(*between, *at)] - VANISH_COST * ("gone" in (before[0], after[0]))
         return log - np.log(modes) * (at[1] >= 0 > at[0])
 
     likely = {}
     for sequence in product(*states):
         log = sum(emission(t, k) for t, (k, _) in enumerate(sequence))
-        log -= LEAVE_COST * sum(sequence[t][0] == "gone" for t in (0, -1))
+        log -= VANISH_COST * sum(sequence[t][0] == "gone" for t in (0, -1))
         log -= np.log(modes) * (not isinstance(sequence[0][0], str))
         log += sum(step_of(t, *pair) for t, pair in enumerate(pairwise(sequence)))
         likely[sequence] = log
@@ -104,7 +102,7 @@ def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     rest, free, right, left = np.diagonal(every)[0, :-1].T  # in the mode of the step before
     change = 1 - np.exp(-MODE_CHANGES_S / 15)
     stays = -np.log(1 + change)  # of two that are possible
-    assert rest[:2] == pytest.approx([stays, stays - 0.5 * (0.02 / STANDING_M) ** 2])
+    assert rest[:2] == pytest.approx([stays, stays - 0.5 * (0.02 / SAME_POSE_M) ** 2])
     assert rest[2] < -1000
     assert free[0] == pytest.approx(stays - FREE_COST_S / 15)
     assert free[2] == pytest.approx(stays - JUMP_COST - FREE_COST_S / 15)  # any, at some cost
@@ -183,10 +181,10 @@ def test_a_held_object_turns_about_the_wrist(cup: ObjectMesh) -> None:
     in_hand = every[2, 2, 0, :-1] + np.log(1 + 2 * (1 - np.exp(-MODE_CHANGES_S / 15)))
     assert in_hand[0] == pytest.approx(0, abs=1e-9)
     # what stays behind is off by the turn, and by the shift as far as the turn is known
-    sigma = np.hypot(HELD_RAD, HELD_RAD_S / 15)
+    sigma = np.hypot(SAME_POSE_RAD, HELD_RAD_S / 15)
     arm = np.linalg.norm(cup.centre_at(before[0]) - wrist)
     moved = np.linalg.norm(cup.centre_at(after[0]) - cup.centre_at(before[0]))
-    shift = moved / np.sqrt(HELD_M**2 + (HELD_M_S / 15) ** 2 + (arm * sigma) ** 2)
+    shift = moved / np.sqrt(SAME_POSE_M**2 + (HELD_M_S / 15) ** 2 + (arm * sigma) ** 2)
     assert in_hand[1] == pytest.approx(-0.5 * ((np.radians(40) / sigma) ** 2 + shift**2))
 
 

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.object_track.bridges import UNSURE_M
 from intercap_core.object_track.evidence import TURN_SCALE
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import (
@@ -20,6 +19,7 @@ from intercap_core.object_track.given_poses import (
 )
 from intercap_core.object_track.motion import GROWTH_LOST_M_S
 from intercap_core.object_track.tracker import Track, describe_contradiction
+from intercap_core.object_track.turns import UNSURE_M
 from intercap_core.object_track.view_report import ViewReport
 from intercap_core.object_track.whole import FrameResult, FrameStatus, flag_frames
 from intercap_core.stages import object_track
