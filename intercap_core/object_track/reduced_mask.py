@@ -86,41 +86,24 @@ def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
     """
     if not rle:
         return EMPTY
-    ends = Runs(rle, lens.height, lens.width).ends
-    left, right, top, bottom = _bounds(ends, lens.height, step)
-    if left > right or top > bottom:
+    runs = Runs(rle, lens.height, lens.width)
+    x, y, width, height = runs.box
+    left, top = -(-x // step), -(-y // step)  # rounded up
+    shape = (y + height - 1) // step - top + 1, (x + width - 1) // step - left + 1
+    if 0 in shape:
         return EMPTY
-    mask = np.zeros((bottom - top + 1, right - left + 1), np.bool_)
-    _fill(ends, lens.height, step, left, top, mask)
+    mask = np.zeros(shape, np.bool_)
+    _fill(runs.ends, lens.height, step, left, top, mask)
     return ReducedMask(left, top, mask)
 
 
 @numba.njit(cache=True, nogil=True)
-def _bounds(ends: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
-    """Return left, right, top, bottom (inclusive) of the reduced pixels set.
+def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
+    """Set the reduced pixels of runs in ``mask``, whose first pixel is (left, top).
 
     ``ends`` (R,) are the ends of runs that are alternately unset and set, column by column: pixel
     number = column * height + row, at full resolution.
     """
-    left, right, top, bottom = 1 << 30, -1, 1 << 30, -1
-    for i in range(1, len(ends), 2):
-        start, end = ends[i - 1], ends[i]
-        if end > start:
-            for column in range(start // height, (end - 1) // height + 1):
-                if column % step:
-                    continue
-                first = max(start - column * height, 0)
-                last = min(end - 1 - column * height, height - 1)
-                first, last = (first + step - 1) // step, last // step
-                if first <= last:
-                    left, right = min(left, column // step), max(right, column // step)
-                    top, bottom = min(top, first), max(bottom, last)
-    return left, right, top, bottom
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
-    """Set the pixels of runs (see :func:`_bounds`) in ``mask``; its first pixel is (left, top)."""
     for i in range(1, len(ends), 2):
         start, end = ends[i - 1], ends[i]
         if end > start:

@@ -16,7 +16,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from intercap_core.body.keypoints import ARM_BONES, LEG_BONES, keypoint_pairs, of_side
-from intercap_core.person.groups import PersonGroup
+from intercap_core.person.groups import MIN_DISTANCE_M, PersonGroup
 
 # Standard deviations of thigh, shank, upper arm, forearm, shoulder width and trunk among adults,
 # metres, measured over the shapes of the open body.
@@ -26,10 +26,6 @@ MAX_BODY_SPEED_M_S = 4.0  # largest speed of a body's centre; people run slower 
 # for joined tracks to be free of doubt. Tuned on the studio: with double, an uncertain return is
 # not reported (tests/person/test_subject.py).
 MAX_LINK_GAP_S = 2.0
-# Noise of a person's centre between sets. Tuned on the studio: a tenth of it splits the subject's
-# track of cup_drink_s04 (config/field/no_depth.yaml), half and double change nothing.
-LINK_SLACK_M = 0.25
-
 # Keypoint pairs of each length, (1 or 2, 2), in the order of BUILD_SPREADS_M. A limb has one pair
 # for each side, whose lengths are averaged.
 _BONES = (
@@ -100,7 +96,7 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
         used_groups: set[int] = set()
         used_tracks: set[int] = set()
         for distance, g, k in pairs:
-            reach = LINK_SLACK_M + MAX_BODY_SPEED_M_S * gaps[k]
+            reach = MIN_DISTANCE_M + MAX_BODY_SPEED_M_S * gaps[k]
             if g in used_groups or k in used_tracks or distance > reach:
                 continue
             used_groups.add(g)
@@ -206,10 +202,10 @@ def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
     for (before, earlier), (after, later) in _seams(first, second):
         apart = later.distance(earlier)
         gap = float(times[after] - times[before])
-        if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
+        if apart > MIN_DISTANCE_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
         # 1.2 m/s: a usual walk
-        result -= 0.5 * (apart / (LINK_SLACK_M + 1.2 * gap)) ** 2
+        result -= 0.5 * (apart / (MIN_DISTANCE_M + 1.2 * gap)) ** 2
     alike = same_build(first.track, second.track)
     # below a ratio of -3 the builds contradict; tuned on the studio
     return result + alike if alike > -3.0 else NEVER
