@@ -18,7 +18,7 @@ from intercap_core.body_fit import cloud_term, keypoint_term, self_term
 from intercap_core.body_fit.prior_term import prior_rows
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.term_inputs import Bodies
-from intercap_core.geometry.solve.robust import geman_mcclure
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS, geman_mcclure
 
 
 class Rows(NamedTuple):
@@ -84,7 +84,7 @@ class BodyEnergy:
         return model.forward(model.parameters(vectors), vertex_ids=pairs.vertices).vertices
 
     def _keypoint_rows(self, bodies: Bodies) -> Iterator[Rows]:
-        problem, scale = self.problem, keypoint_term.KEYPOINT_SCALE
+        problem, scale = self.problem, OUTLIER_SIGMAS
         params = problem.model.parameters(bodies.vectors)
         carrier = keypoint_term.carrier_rotations(params, problem.keypoints)
         arms = (carrier @ bodies.offsets[..., None])[..., 0]

@@ -33,21 +33,17 @@ from bench.body_energy import BodyEnergy
 from bench.clips import JointClip
 from bench.object_baseline import Crops, ObjectImages
 from bench.object_baseline import Recipe as ObjectRecipe
-from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body_fit.term_inputs import Bodies
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.solve.robust import geman_mcclure
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.proximity import proximity
-from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
+from intercap_core.joint.skin import SURFACE_SIGMA, VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT_SHIFT, OBJECT_TURN, State
-from intercap_core.joint.terms.contact import CONTACT_SIGMA
-from intercap_core.joint.terms.ground import GROUND_SIGMA, MIN_STANDING_VERTICES
 from intercap_core.joint.terms.motion import (
     ACCELERATION_OUTLIER,
     BODY_ACCELERATION,
-    FINGER_ACCELERATION,
 )
 from intercap_core.joint.terms.penetration import PENETRATION_SIGMA, PENETRATION_TOLERANCE
 
@@ -200,7 +196,7 @@ def contact_weights(geometry: Geometry, touching: np.ndarray) -> Tensor:
 def contact(distance: Tensor, weights: Tensor) -> Tensor:
     """Q_t E_C of distances (T, M), metres, of the likely-contact vertices."""
     return (
-        0.5 * (weights * geman_mcclure(distance**2, CONTACT_SCALE_M).rho).sum() / CONTACT_SIGMA**2
+        0.5 * (weights * geman_mcclure(distance**2, CONTACT_SCALE_M).rho).sum() / SURFACE_SIGMA**2
     )
 
 
@@ -213,9 +209,7 @@ def penetration(distance: Tensor, geometry: Geometry) -> Tensor:
 
 def standing(object_vertices: Tensor, clip: JointClip) -> Tensor:
     """Number (T, 1) of vertices on which the object stands."""
-    return (
-        (_height(object_vertices, clip) < 0).sum(1, keepdim=True).clamp_min(MIN_STANDING_VERTICES)
-    )
+    return (_height(object_vertices, clip) < 0).sum(1, keepdim=True).clamp_min(1)
 
 
 def ground(posed: Posed, clip: JointClip, stands_on: Tensor) -> Tensor:
@@ -223,7 +217,7 @@ def ground(posed: Posed, clip: JointClip, stands_on: Tensor) -> Tensor:
     share = torch.as_tensor(clip.geometry.skin.share).to(posed.skin) / VERTICES_PER_MEASUREMENT
     body = (share * _height(posed.skin, clip) ** 2).sum()
     object_ = (_height(posed.object_vertices, clip) ** 2 / stands_on).sum()
-    return 0.5 * (body + object_) / GROUND_SIGMA**2
+    return 0.5 * (body + object_) / SURFACE_SIGMA**2
 
 
 def _height(points: Tensor, clip: JointClip) -> Tensor:
@@ -236,19 +230,17 @@ def _height(points: Tensor, clip: JointClip) -> Tensor:
 
 def body_motion(joints: Tensor, fps: float) -> Tensor:
     """E_S of joints (T, 55, 3)."""
-    fingers = torch.arange(NUM_JOINTS) >= JOINT_INDEX["left_index1"]
-    sigma = torch.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
-    return _accelerations(joints, sigma[:, None], fps)
+    return _accelerations(joints, fps)
 
 
 def object_motion(moments: Tensor, fps: float) -> Tensor:
     """E_A of points with the object's moments (T, 6, 3)."""
-    return _accelerations(moments, torch.tensor(BODY_ACCELERATION), fps)
+    return _accelerations(moments, fps)
 
 
-def _accelerations(points: Tensor, sigma: Tensor, fps: float) -> Tensor:
+def _accelerations(points: Tensor, fps: float) -> Tensor:
     ahead, now, behind = points[2:], points[1:-1], points[:-2]
-    scaled = (behind - 2 * now + ahead) * fps**2 / (sigma * ACCELERATION_OUTLIER)
+    scaled = (behind - 2 * now + ahead) * fps**2 / (BODY_ACCELERATION * ACCELERATION_OUTLIER)
     return ACCELERATION_OUTLIER**2 * ((1 + (scaled**2).sum(-1)).sqrt() - 1).sum()
 
 

@@ -34,7 +34,6 @@ FRAMES_PER_SECOND = 30.0  # of the network's input (Zhang et al. 2021)
 COORDINATES = 3 * len(MARKER_NAMES)
 _ROWS, _COLUMNS = 1, 8  # of reflection, at each side (Zhang et al. 2021)
 _CHANNELS = (1, 32, 64, 64, 64, 64)  # before and after each block (Zhang et al. 2021)
-LATENT = _CHANNELS[-1] * (COORDINATES + 2 * _ROWS)
 # F frames have F - 1 steps, and a reflection by _COLUMNS needs one column more than that
 FEWEST_FRAMES = _COLUMNS + 2
 _HINT = "take the release's file, or remove joint.lemo to penalise joint accelerations instead"

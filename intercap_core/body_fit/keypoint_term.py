@@ -42,9 +42,7 @@ from intercap_core.body_fit.term_inputs import (
     contiguous,
 )
 from intercap_core.geometry.camera import projection
-
-# Scale of rho_J, standard deviations: a larger residual is an outlier. Tuned on the studio.
-KEYPOINT_SCALE = 4.0
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 
 
 class Keypoints(NamedTuple):
@@ -185,5 +183,5 @@ def _keypoint_data(inputs: TermInputs, like: Tensor) -> KeypointData:
         targets=array(targets.points),
         targets_confidence=array(targets.confidence),
         targets_sigma=float(targets.sigma),
-        scale=KEYPOINT_SCALE,
+        scale=OUTLIER_SIGMAS,
     )

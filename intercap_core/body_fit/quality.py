@@ -14,8 +14,7 @@ from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.body.keypoints import CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
-from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
-from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
+from intercap_core.geometry.solve.robust import MEDIAN_CHI_3, OUTLIER_SIGMAS
 from intercap_core.schemas import BAD_BODY_M, BODY_PARTS
 
 # Standard deviation along one coordinate beyond which a part is undetermined, metres: half of its
@@ -99,7 +98,7 @@ class PartEvidence(NamedTuple):
     """(N, 8) share of the part's skin samples with depth points."""
     excess: Tensor
     """(N, 8) mean square residual of the part's detections over its assumed variance, weighted by
-    confidence, at least 1. Outliers count up to `KEYPOINT_SCALE`: views may agree on a wrong point,
+    confidence, at least 1. Outliers count up to `OUTLIER_SIGMAS`: views may agree on a wrong point,
     and those that contradict it may be right."""
 
 
@@ -125,13 +124,13 @@ def compare_parts(
     result = PartEvidence(
         unknown, unknown.clone(), none, none.clone(), none.clone(), none + 1
     )  # fmt: skip
-    square = whitened.clamp(max=KEYPOINT_SCALE) ** 2 / 2
+    square = whitened.clamp(max=OUTLIER_SIGMAS) ** 2 / 2
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):
         at = torch.isin(index, torch.as_tensor(_PARTS[part].keypoints))
         if not bool(at.any()):
             continue
-        weight, good = confidence[:, :, at], whitened[:, :, at] <= KEYPOINT_SCALE
+        weight, good = confidence[:, :, at], whitened[:, :, at] <= OUTLIER_SIGMAS
         # axes of the sums: views, and keypoints except for arms and legs
         over = (1,) if part.endswith(("arm", "leg")) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)

@@ -28,7 +28,10 @@ HAND_M = 0.1  # mean distance of finger joints and fingertips from the wrist (an
 # tasks (tuned).
 _FREE_WALK = 1.1
 HAND_POSE_S = 0.5  # errors of detected hands, and poses of hands, last this long; tuned
-_CREEP = 0.03  # rad in one second, of a firm grasp: `term.CREEP` at the distance ``HAND_M``
+# Creep of grips and soles: a random walk, m in one second. Tuned on the studio: without stick grips
+# slip by 27 mm/s, with it by 8; without plant soles slip by 34 mm/s, with it by 2
+# (bench/RESULTS.md, commit 86d72be).
+CREEP = 0.003
 _ROUNDS = 10  # of iterated weights
 
 
@@ -88,7 +91,7 @@ def _steps(
     turned = state.rotation[1:] @ np.swapaxes(state.rotation[:-1], 1, 2)
     place = np.einsum("tji,tj->ti", state.rotation, wrist - state.translation)
     slip = window_displacement(place[:, None], fps)[:, 0] / HAND_M
-    of_object = _CREEP**2 / fps + np.square(slip)
+    of_object = (CREEP / HAND_M) ** 2 / fps + np.square(slip)
     share = variance / (variance + of_object)
     apart = (Rotation.from_matrix(turned) * by_arm.inv()).as_rotvec()
     steps = Rotation.from_rotvec(share[:, None] * apart) * by_arm

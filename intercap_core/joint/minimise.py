@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.body.parameters import TRANSL
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.state import BODY_SHIFT, BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
+from intercap_core.joint.state import BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +100,6 @@ def limited(step: np.ndarray) -> np.ndarray:
     def largest(*columns: slice) -> np.ndarray:
         return np.maximum.reduce([np.abs(step[:, part]).max(axis=1) for part in columns])
 
-    turns, shifts = largest(BODY_TURNS, OBJECT_TURN), largest(BODY_SHIFT, OBJECT_SHIFT)
+    turns, shifts = largest(BODY_TURNS, OBJECT_TURN), largest(TRANSL, OBJECT_SHIFT)
     excess = np.maximum(turns / 0.5, shifts / 0.1)
     return step / np.maximum(1.0, excess)[:, None]

@@ -13,7 +13,7 @@ from intercap_core.body.parameters import TRANSL, BodyParameters
 
 # Columns of one frame's unknowns.
 BODY = slice(0, TRANSL.stop)  # 55 rotation vectors and the translation
-BODY_TURNS, BODY_SHIFT = slice(0, TRANSL.start), TRANSL
+BODY_TURNS = slice(0, TRANSL.start)
 OBJECT = slice(BODY.stop, BODY.stop + 6)  # turn about the object's origin (left), then shift
 OBJECT_TURN = slice(OBJECT.start, OBJECT.start + 3)
 OBJECT_SHIFT = slice(OBJECT.start + 3, OBJECT.stop)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from intercap_core.body.lemo import FEWEST_FRAMES, LATENT, MotionEncoder
+from intercap_core.body.lemo import FEWEST_FRAMES, MotionEncoder
 from intercap_core.errors import UserError
 from tests.helpers.bodies import random_normal
 from tests.helpers.lemo_release import (
@@ -47,7 +47,7 @@ def _by_hand(state: dict[str, torch.Tensor], steps: np.ndarray) -> np.ndarray:
 def test_latents_equal_convolutions_in_numpy(tmp_path: Path) -> None:
     steps = random_normal(FEWEST_FRAMES - 1, COORDINATES) * 0.02
     found = _load(tmp_path).latents(steps)
-    assert found.shape == (FEWEST_FRAMES - 1, LATENT)
+    assert found.shape == (FEWEST_FRAMES - 1, 64 * 245)
     expected = _by_hand(random_state(), steps.numpy() / SPREAD)
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=1e-9)
 

@@ -9,6 +9,7 @@ import torch
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.body_fit import quality
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 from intercap_core.schemas import BODY_PARTS
 
 ALL = torch.arange(135)
@@ -77,7 +78,7 @@ def test_one_wrong_view_of_four_counts_as_far_as_the_scale_of_outliers(fine):
     whitened, confidence, _ = fine
     whitened[:, 0, KEYPOINT_NAMES.index("left_wrist")] = 100.0
     excess = quality.joint_excess(_evidence(whitened, confidence))[0, JOINT_INDEX["left_wrist"]]
-    assert excess == pytest.approx((quality.KEYPOINT_SCALE**2 + 7 * 0.7**2) / 16)
+    assert excess == pytest.approx((OUTLIER_SIGMAS**2 + 7 * 0.7**2) / 16)
 
 
 def test_unseen_parts_are_undetermined_by_their_deviation(fine):

@@ -12,12 +12,12 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.joint.contact.annotated import annotation_evidence, find_issues, hold_exactly
 from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.contact.detect import (
-    FRAME_SIGMA,
     RegionMotion,
     contact_probability,
     lasting_error,
 )
 from intercap_core.joint.contact_estimate import ContactEstimate
+from intercap_core.joint.skin import SURFACE_SIGMA
 from intercap_core.schemas import CONTACT_REGIONS
 
 FPS = 15.0
@@ -132,12 +132,12 @@ def test_lasting_error_sharpens_the_ends_of_a_contact():
 def test_lasting_error_is_the_mean_of_prior_and_measurements():
     motion = _motion(np.full((10, 1), 0.004), 0.0, 0.0, sigma=0.01)
     error, sigma = lasting_error(motion, np.ones((10, 1)), 2.0)
-    precision = 5 / FRAME_SIGMA**2
+    precision = 5 / SURFACE_SIGMA**2
     np.testing.assert_allclose(error, 0.004 * precision / (precision + 1e4), rtol=1e-9)
-    np.testing.assert_allclose(sigma, np.hypot((precision + 1e4) ** -0.5, FRAME_SIGMA), rtol=1e-9)
+    np.testing.assert_allclose(sigma, np.hypot((precision + 1e4) ** -0.5, SURFACE_SIGMA), rtol=1e-9)
     untouched, sigma = lasting_error(motion, np.full((10, 1), 0.4), 2.0)
     assert untouched == 0
-    np.testing.assert_allclose(sigma, np.hypot(0.01, FRAME_SIGMA), rtol=1e-9)
+    np.testing.assert_allclose(sigma, np.hypot(0.01, SURFACE_SIGMA), rtol=1e-9)
 
 
 def test_change_of_an_estimate_ignores_unknown_contact():

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body import lemo
+from intercap_core.body.parameters import TRANSL
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.state import ALL, BODY, BODY_SHIFT, State
+from intercap_core.joint.state import ALL, BODY, State
 from intercap_core.joint.terms.motion import (
     BODY_ACCELERATION,
     BodyMotion,
@@ -45,7 +46,7 @@ def _moving(frames: int = FRAMES) -> State:
     """A body that walks and bends with jitter."""
     rng = np.random.default_rng(0)
     body = rng.normal(scale=0.01, size=(frames, BODY.stop)) + rng.normal(scale=0.2, size=BODY.stop)
-    body[:, BODY_SHIFT] += np.arange(frames)[:, None] * [0.03, 0.0, 0.01]
+    body[:, TRANSL] += np.arange(frames)[:, None] * [0.03, 0.0, 0.01]
     rotation = np.tile(np.eye(3), (frames, 1, 1))
     return State(body, np.zeros(10), np.zeros((frames, 10)), rotation, np.zeros((frames, 3)))
 
@@ -99,8 +100,8 @@ def test_energy_does_not_depend_on_place_and_heading(context, term):
     turn = Rotation.from_rotvec(1.2 * UP)
     body, pelvis = state.body.copy(), context.geometry.at(state).joints[0][:, 0]
     body[:, :3] = (turn * Rotation.from_rotvec(state.body[:, :3])).as_rotvec()
-    fixed = pelvis - state.body[:, BODY_SHIFT]  # turns about the pelvis leave it where it is
-    body[:, BODY_SHIFT] = turn.apply(pelvis) - fixed + [3.0, 0.0, -2.0]
+    fixed = pelvis - state.body[:, TRANSL]  # turns about the pelvis leave it where it is
+    body[:, TRANSL] = turn.apply(pelvis) - fixed + [3.0, 0.0, -2.0]
     turned = replace(state, body=body)
     term.refresh(turned)
     assert _equations(term, turned).total == pytest.approx(energy, rel=1e-6)
@@ -112,7 +113,7 @@ def test_everyday_motion_costs_as_much_as_in_the_joints_term(context, unbiased):
     shift = np.cumsum(np.cumsum(rng.normal(size=(frames, 3)), 0), 0) / lemo.FRAMES_PER_SECOND**2
     state = _moving(frames=frames)
     body = np.tile(state.body[:1], (frames, 1))
-    body[:, BODY_SHIFT] = 0.1 * BODY_ACCELERATION * shift
+    body[:, TRANSL] = 0.1 * BODY_ACCELERATION * shift
     moved = replace(state, body=body)
     unbiased.refresh(moved)
     joints = BodyMotion(context)

@@ -30,6 +30,9 @@ SIGMA_PER_MAD = 1.4826
 # Median length of a 3D normal error, in standard deviations of one coordinate: the median of the
 # chi distribution with three degrees of freedom.
 MEDIAN_CHI_3 = 1.5382
+# Residual, in standard deviations, at which a measurement counts a quarter: the scale of Geman and
+# McClure for keypoints and for images of the object. Tuned on the studio.
+OUTLIER_SIGMAS = 4.0
 
 
 @register_jitable

@@ -14,11 +14,11 @@ import numpy as np
 
 from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.proximity import Proximity
-from intercap_core.joint.skin import Patches
+from intercap_core.joint.skin import SURFACE_SIGMA, Patches
 
-# Standard deviations of a region's distance beyond those of the fits.
-LASTING_SIGMA = 0.006  # m, the same in all frames: shape, clothing, two meshes; tuned on the studio
-FRAME_SIGMA = 0.004  # m, different in each frame; tuned on the studio
+# Standard deviation of a region's distance beyond that of the fits, metres. It is the same in all
+# frames, as errors of shape, clothing and both meshes are. Tuned on the studio.
+LASTING_SIGMA = 0.006
 
 # Contacts per second of a free region. Four in five are brief (a sip, a kick: 0.3 s), the others
 # are holds (3 s). Tuned on the studio.
@@ -47,7 +47,7 @@ def region_motion(
 ) -> RegionMotion:
     """Summarise the patches' vertices by region, by means that weigh the nearest vertices most.
 
-    A vertex 4 mm farther away than the nearest one has a third of its weight (tuned).
+    A vertex that is ``SURFACE_SIGMA`` farther away than the nearest one has a third of its weight.
 
     Args:
         points: (T, M, 3) patch vertices, master frame, metres.
@@ -71,7 +71,7 @@ def region_motion(
     for r in range(regions):
         members = np.flatnonzero(patches.region == r)
         away = near.distance[:, members]
-        weight = np.exp((away.min(axis=1, keepdims=True) - away) / 0.004)
+        weight = np.exp((away.min(axis=1, keepdims=True) - away) / SURFACE_SIGMA)
         weight *= patches.share[members]
         weight /= weight.sum(axis=1, keepdims=True)
         distance[:, r] = (weight * away).sum(axis=1)
@@ -107,7 +107,7 @@ def contact_probability(
         return _TOUCH.posterior((near + slip) / correlated + given, fps)
 
     unknown = np.zeros(motion.distance.shape[1])
-    first = posterior(unknown, np.hypot(motion.sigma, FRAME_SIGMA))
+    first = posterior(unknown, np.hypot(motion.sigma, SURFACE_SIGMA))
     return posterior(*lasting_error(motion, first, correlated))
 
 
@@ -125,7 +125,7 @@ def lasting_error(
     """
     prior = np.median(motion.sigma, axis=0)
     # a frame's deviation beyond the usual one is no lasting error (a lost track)
-    frame = FRAME_SIGMA**2 + np.maximum(motion.sigma**2 - prior**2, 0.0)
+    frame = SURFACE_SIGMA**2 + np.maximum(motion.sigma**2 - prior**2, 0.0)
     weight = np.maximum(0.0, 2 * probability - 1) / (frame * correlated)
     limit = 3.0 * prior
     variance = 1 / (prior**-2 + weight.sum(axis=0))

@@ -21,19 +21,19 @@ import torch
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
 from intercap_core.body_fit import cloud_term, keypoint_term
 from intercap_core.body_fit.evidence import Evidence
-from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
 from intercap_core.geometry.camera import projection
-from intercap_core.geometry.solve.robust import geman_mcclure_weight
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS, geman_mcclure_weight
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvidence, Cameras
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.state import BODY, BODY_SHIFT, State
+from intercap_core.joint.state import BODY, State
 from intercap_core.joint.terms.term import Equation, JointTerm
 from intercap_core.sequence_inputs import SequencePaths
 
@@ -155,7 +155,7 @@ class BodyData(JointTerm):
         # a frame without a fit stays near its interpolated pose: 0.3 rad, 0.1 m (tuned)
         filled = np.setdiff1d(np.arange(len(state)), frames)
         precision = np.full(BODY.stop, 0.3**-2)
-        precision[BODY_SHIFT] = 0.1**-2
+        precision[TRANSL] = 0.1**-2
         offset = state.body[filled] - self._interpolated[filled]
         hessian[filled] = np.diag(precision)
         gradient[filled] = precision * offset
@@ -249,7 +249,7 @@ def _add_keypoints(
     sigma = views.sigma[part][..., None]
     known = (views.confidence[part] > 0)[..., None]
     residual = torch.where(known, (pixels - views.observed[part]) / sigma, 0)
-    weight = views.confidence[part] * geman_mcclure_weight((residual**2).sum(-1), KEYPOINT_SCALE)
+    weight = views.confidence[part] * geman_mcclure_weight((residual**2).sum(-1), OUTLIER_SIGMAS)
     by_point = by_camera @ rotation[:, None] / sigma[..., None]  # (b, C, K, 2, 3)
     by_point = torch.where(known[..., None], by_point, 0)
     centre = _poses(evidence).to(points)[:, :3, 3]

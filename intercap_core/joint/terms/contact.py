@@ -21,13 +21,10 @@ import numpy as np
 
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.equations import BandedEquations
+from intercap_core.joint.skin import SURFACE_SIGMA
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Standard deviation of a touching patch's distance, metres: errors of skin, mesh and calibration.
-# Tuned on the studio: without E_C contact of vertices has an F1 of 0.44, with it 0.51
-# (bench/RESULTS.md, commit 86d72be).
-CONTACT_SIGMA = 0.004
 # Weight of an annotated contact relative to a detected one while the region stands apart. Tuned on
 # `python -m bench.annotate_driven`: contact of the meshes has an F1 of 0.97 (weight 1: 0.88), and
 # with 16 the hand is displaced.
@@ -121,7 +118,7 @@ class Contact(JointTerm):
 
     def __init__(self, context: TermContext) -> None:
         super().__init__(context)
-        self._scale = context.settings.contact_weight / CONTACT_SIGMA**2
+        self._scale = context.settings.contact_weight / SURFACE_SIGMA**2
         self._probability: np.ndarray | None = None  # (T, R)
         self._annotated: np.ndarray | None = None  # (T, R)
         self._draws: np.ndarray | None = None  # (T, R) probability times annotated weight
@@ -160,7 +157,7 @@ class Contact(JointTerm):
         more = np.zeros_like(self._probability)
         for region in np.flatnonzero(self._annotated.any(0)).tolist():
             nearest = np.abs(distance[:, patches.region == region]).min(1)
-            apart = np.clip((nearest - CONTACT_TOLERANCE) / CONTACT_SIGMA, 0.0, 1.0)
+            apart = np.clip((nearest - CONTACT_TOLERANCE) / SURFACE_SIGMA, 0.0, 1.0)
             more[:, region] = self._annotated[:, region] * apart
         self._draws = (1.0 + (ANNOTATED_CONTACT_WEIGHT - 1.0) * more) * self._probability
 

@@ -13,16 +13,9 @@ import numpy as np
 
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.proximity import along_by_object
-from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
+from intercap_core.joint.skin import SURFACE_SIGMA, VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
-
-# Standard deviation of the floor's height, metres. Tuned on the studio: without both terms soles
-# are 3.8 mm off the floor, with them 2.7 (bench/RESULTS.md, commit 86d72be).
-GROUND_SIGMA = 0.005
-# An object's vertices below the floor weigh together as one measurement. Fewer vertices than this,
-# such as an edge that just touches the floor, weigh proportionally less. Tuned on the studio.
-MIN_STANDING_VERTICES = 4
 
 
 class _Ground(JointTerm):
@@ -50,7 +43,7 @@ class BodyGround(_Ground):
     def add(self, state: State, equations: BandedEquations) -> None:
         posed = self.geometry.at(state)
         height = self._floor.depths(posed.skin)
-        scale = self._weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+        scale = self._weight / SURFACE_SIGMA**2 / VERTICES_PER_MEASUREMENT
         weight = np.where(height < 0, self.geometry.skin.share, 0.0) * scale
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
@@ -81,14 +74,14 @@ class ObjectGround(_Ground):
     def refresh(self, state: State) -> None:
         """Count the vertices on which the object stands."""
         below = self._height(state) < 0
-        self._standing = np.maximum(below.sum(axis=1, keepdims=True), MIN_STANDING_VERTICES)
+        self._standing = np.maximum(below.sum(axis=1, keepdims=True), 1)
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_G' at ``state`` with the number of vertices of the last :meth:`refresh`."""
         assert self._standing is not None, "refresh comes first"
         height = self._height(state)
         weight = (height < 0) / self._standing
-        weight = weight * self._weight / GROUND_SIGMA**2
+        weight = weight * self._weight / SURFACE_SIGMA**2
         vertices = self.geometry.at(state).object_vertices
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:

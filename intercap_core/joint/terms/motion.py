@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body import lemo
-from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS
+from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.lemo import MotionEncoder
 from intercap_core.joint.equations import ACCELERATION, BandedEquations
 from intercap_core.joint.state import BODY, OBJECT, State
@@ -29,8 +29,7 @@ from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContex
 # Standard deviations of accelerations in everyday motion. Tuned on the studio: without E_S and E_A
 # the body's acceleration errs by 0.75 mm a frame^2, with them by 0.71 (bench/RESULTS.md, commit
 # 86d72be).
-BODY_ACCELERATION = 6.0  # m/s^2, of trunk, limbs and carried objects
-FINGER_ACCELERATION = 10.0  # m/s^2; tuned on the studio
+BODY_ACCELERATION = 6.0  # m/s^2, of body and carried objects
 ACCELERATION_OUTLIER = 2.0  # standard deviations: a start, a stop, an impact; tuned on the studio
 
 _HIPS = [JOINT_INDEX["left_hip"], JOINT_INDEX["right_hip"]]
@@ -62,7 +61,6 @@ class _Smoothness(JointTerm):
         columns: slice,
         points: np.ndarray,
         jacobian: np.ndarray,
-        sigma: np.ndarray,
         factor: float,
         equations: BandedEquations,
     ) -> None:
@@ -70,18 +68,17 @@ class _Smoothness(JointTerm):
 
         Args:
             jacobian: (T, N, 3, m) derivative of the points by the unknowns ``columns``.
-            sigma: (N,) standard deviations, m/s^2.
             factor: weight of the term.
         """
         if len(points) < 3:
             return
-        acceleration = accelerations(points, self._fps) / sigma[:, None]
+        acceleration = accelerations(points, self._fps) / BODY_ACCELERATION
         weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
-        unit = self._fps**2 / sigma
+        unit = self._fps**2 / BODY_ACCELERATION
         equations.add_rows(
             self.name,
             columns,
-            lambda at, some: jacobian[at, some] * unit[some, None, None],
+            lambda at, some: jacobian[at, some] * unit,
             weight * factor,
             acceleration,
             energy * factor,
@@ -106,10 +103,8 @@ class BodyMotion(_Smoothness):
         return context.encoder is None
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        fingers = np.arange(NUM_JOINTS) >= FIRST_FINGER
-        sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
         factor = self._settings.body_smoothness
-        self._add_accelerations(BODY, *self.geometry.at(state).joints, sigma, factor, equations)
+        self._add_accelerations(BODY, *self.geometry.at(state).joints, factor, equations)
 
 
 class ObjectMotion(_Smoothness):
@@ -126,9 +121,8 @@ class ObjectMotion(_Smoothness):
 
     def add(self, state: State, equations: BandedEquations) -> None:
         points, jacobian = self.geometry.at(state).moments
-        sigma = np.full(points.shape[1], BODY_ACCELERATION)
         factor = self._settings.object_smoothness
-        self._add_accelerations(OBJECT, points, jacobian, sigma, factor, equations)
+        self._add_accelerations(OBJECT, points, jacobian, factor, equations)
 
 
 class LearnedMotion(JointTerm):

@@ -28,7 +28,7 @@ from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.transforms import rigid, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import open_renderer
-from intercap_core.geometry.solve.robust import geman_mcclure_weight
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS, geman_mcclure_weight
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvidence, Cameras
@@ -49,8 +49,6 @@ from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
 from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording, ViewCache
 from intercap_core.object_track.view import FitContext
 from intercap_core.object_track.view_report import ViewReport
-
-IMAGES_OUTLIER = 5.0  # standard deviations at which evidence counts a quarter; tuned on the studio
 
 
 class ObjectImages:
@@ -207,7 +205,7 @@ class ObjectImagesData(JointTerm):
         information, gradient = information / self._noise, gradient / self._noise
         # step from the compared pose to the minimum of this frame's evidence
         own = -np.linalg.solve(information + np.diag(UNKNOWN_SIGMA**-2), gradient)
-        weight = geman_mcclure_weight(own @ information @ own, IMAGES_OUTLIER)
+        weight = geman_mcclure_weight(own @ information @ own, OUTLIER_SIGMAS)
         information, gradient = weight * information, weight * gradient
         mesh = np.linalg.inv(information + np.diag(1 / self._tracked.spread[t]))  # K
         freed = np.eye(6) - information @ mesh

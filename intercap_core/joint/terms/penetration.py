@@ -30,7 +30,8 @@ from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
 # Standard deviation of a depth beyond the tolerance, metres. Tuned on the studio: without both
-# terms the mean penetration is 2.5 mm, with them 1.4 (bench/RESULTS.md, commit 86d72be).
+# terms the mean penetration is 2.5 mm, with them 1.4 (bench/RESULTS.md, commit 86d72be); with 4 mm
+# it is 0.17 mm larger.
 PENETRATION_SIGMA = 0.003
 PENETRATION_TOLERANCE = 0.001  # depth that costs nothing, metres: skin yields; tuned on the studio
 # Skin samples this near to the object are searched for points of it, m: half the spacing of the

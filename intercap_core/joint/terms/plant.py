@@ -14,9 +14,10 @@ import numpy as np
 from intercap_core.body.joints import FOOT_JOINTS
 from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.equations import BandedEquations
+from intercap_core.joint.hand_track import CREEP
 from intercap_core.joint.skin import Patches
 from intercap_core.joint.state import BODY, State
-from intercap_core.joint.terms.term import CREEP, SLIP_OUTLIER, Equation, JointTerm, TermContext
+from intercap_core.joint.terms.term import SLIP_OUTLIER, Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
 # A swinging sole comes to stand 0.18 times per second, and stands for 0.98 s. Tuned on the studio.

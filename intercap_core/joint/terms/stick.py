@@ -17,11 +17,10 @@ import numpy as np
 
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.hand_track import window_displacement, window_frames
+from intercap_core.joint.hand_track import CREEP, window_displacement, window_frames
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.term import (
-    CREEP,
     SLIP_OUTLIER,
     Data,
     Equation,

@@ -22,10 +22,6 @@ from intercap_core.joint.proximity import Proximity, along_by_object
 from intercap_core.joint.sequential import Trust
 from intercap_core.joint.state import ALL, State
 
-# Creep of grips and soles: a random walk, m in one second. Tuned on the studio: without stick grips
-# slip by 27 mm/s, with it by 8; without plant soles slip by 34 mm/s, with it by 2
-# (bench/RESULTS.md, commit 86d72be).
-CREEP = 0.003
 SLIP_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
 
 T = TypeVar("T", bound="JointTerm")
