@@ -34,6 +34,7 @@ from intercap_core.output.site.overlays import (
     choose_frames,
     overlays,
 )
+from intercap_core.output.site.preview import PREVIEW, Preview, make_preview
 from intercap_core.output.site.sequence_page import SequenceContent, page
 from intercap_core.output.site.track_section import read_track
 from intercap_core.output.viewer import page as viewer
@@ -71,9 +72,10 @@ def run(
         master = rig.names.index(str(scene.attributes["master"]))
         description, energies = _describe_joint(fit, rig, master), _energies(fit)
         rig = rig.moved(fit["master_from_colour"])
-    note, drawn = "", []
+    note, preview = "", None
+    drawn: list[Overlay] = []
     try:
-        drawn = _overlays(paths.frames, measured, posed, rig, image_of, settings)
+        drawn, preview = _overlays(paths.frames, measured, posed, rig, image_of, settings)
     except UserError as error:  # a page without overlays is better than none
         note = str(error)
         log.warning("%s: no overlays: %s", measured.name, error)
@@ -81,6 +83,7 @@ def run(
         metrics=measured,
         intent=sequence.intent or "",
         overlays=drawn,
+        preview=preview,
         note=note,
         joint=description,
         energies=energies,
@@ -94,6 +97,8 @@ def run(
     )
     output.mkdir(parents=True)
     (output / "index.html").write_text(page(content), encoding="utf-8")
+    if preview is not None:
+        (output / PREVIEW).write_bytes(preview.thumbnail.data)
     viewer.write_script(output / viewer.SCRIPT, paths, shown, truth=truth)
 
 
@@ -104,17 +109,19 @@ def _overlays(
     rig: Rig,
     image_of: np.ndarray,
     settings: PageSettings,
-) -> list[Overlay]:
-    """Overlays of body and object on the images of some frames and cameras.
+) -> tuple[list[Overlay], Preview | None]:
+    """Overlays of body and object on the images of some frames and cameras, and a preview.
 
     Frames are evenly spread, and include the one in which the meshes are farthest from the measured
-    points.
+    points. The preview shows the camera that sees most.
     """
     worst = "object_visible_to_cloud" if measured.has_object else "body_visible_to_cloud"
     chosen = choose_frames(measured.values[worst], settings.frames)
-    cameras = sorted(choose_cameras(fit, rig, chosen, settings.cameras))
-    with Frames.open(frames) as images:
-        return overlays(images.showing(image_of), rig, fit, cameras, chosen)
+    cameras = choose_cameras(fit, rig, chosen, settings.cameras)
+    with Frames.open(frames) as opened:
+        images = opened.showing(image_of)
+        drawn = overlays(images, rig, fit, sorted(cameras), chosen)
+        return drawn, make_preview(images, rig, cameras[0], fit, measured)
 
 
 def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:

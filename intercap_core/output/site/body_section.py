@@ -153,7 +153,7 @@ def _by_joint(sigma_mm: np.ndarray) -> str:
         )
         for name, v in rows
     ]
-    return charts.bar_pairs(pairs, "stated deviation, mm", "largest value and median")
+    return charts.bar_pairs(pairs, "standard deviation, mm", "largest value and median")
 
 
 FIT_COLOUR, KEYPOINT_COLOUR = (107, 168, 235), (255, 210, 64)  # RGB

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -23,7 +25,7 @@ class EncodedImage:
 
     data: bytes
     """Content of the image file."""
-    kind: Literal["jpeg", "png"]
+    kind: Literal["jpeg", "png", "webp"]
     width: int
     height: int
     caption: str = ""
@@ -121,6 +123,19 @@ def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
     options = [cv2.IMWRITE_JPEG_QUALITY, 82, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     data = cv2.imencode(".jpg", bgr, options)[1].tobytes()
     return EncodedImage(data, "jpeg", bgr.shape[1], bgr.shape[0], caption)
+
+
+def encode_animation(pictures: Sequence[np.ndarray], seconds: float) -> EncodedImage:
+    """Encode images (H, W, 3) in 0..1 as an endless animated WebP of ``seconds`` per round."""
+    images = [
+        Image.fromarray(np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)) for rgb in pictures
+    ]
+    stream = io.BytesIO()
+    images[0].save(
+        stream, "WEBP", save_all=True, append_images=images[1:], loop=0, quality=60, method=4,
+        duration=max(1, round(1e3 * seconds / len(images))),
+    )  # fmt: skip
+    return EncodedImage(stream.getvalue(), "webp", images[0].width, images[0].height)
 
 
 def encode_png(picture: RenderedImage, caption: str = "") -> EncodedImage:

@@ -14,8 +14,9 @@ from markupsafe import Markup
 from intercap_core.output.site.drawing import EncodedImage
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_POLICY = (  # a page may load nothing but itself
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_POLICY = (  # a page may load nothing but itself and pictures of the site
+    "default-src 'none'; img-src 'self' file: data:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'"
 )
 
 

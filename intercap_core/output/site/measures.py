@@ -1,6 +1,6 @@
-"""Measures on the pages: truth, penetration, distances to clouds, cameras and verdict.
+"""Measures on the pages: truth, penetration, distances to clouds, cameras, estimated errors.
 
-The verdict is the estimate of errors without truth (:mod:`intercap_core.evaluation.verdict`).
+Errors are estimated without truth by :mod:`intercap_core.evaluation.verdict`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from intercap_core.evaluation.verdict.figures import (
     StatedError,
     held_out_cameras,
     stated_errors,
-    verdict_figures,
 )
 from intercap_core.output.site import charts
 from intercap_core.stage_list import ESTIMATES
@@ -48,8 +47,18 @@ _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
     ("rest_jitter_deg", "… its rotation, degrees", 2, False),
     ("motion_onset_frames", "start of motion late or early by, frames", 1, False),
     ("motion_onset_late_frames", "… signed, late is positive", 1, None),
-    ("joint_normalised_median", "error over stated deviation, joints (honest: 0.7-1.4)", 2, None),
-    ("object_normalised_median", "error over stated deviation, object (honest: 0.7-1.4)", 2, None),
+    (
+        "joint_normalised_median",
+        "error over its standard deviation, joints (calibrated: 1)",
+        2,
+        None,
+    ),
+    (
+        "object_normalised_median",
+        "error over its standard deviation, object (calibrated: 1)",
+        2,
+        None,
+    ),
 )
 
 
@@ -117,7 +126,7 @@ def _sweep(known: Sequence[SequenceMetrics]) -> str:
 
 
 def _reliability(known: Sequence[SequenceMetrics]) -> str:
-    """Plot the share of true contact over the stated probability of contact."""
+    """Plot the share of true contact over the estimated probability of contact."""
     table = contact_figures.contact_reliability(known)
     if table is None or len(table.count) < 2:
         return ""
@@ -126,7 +135,7 @@ def _reliability(known: Sequence[SequenceMetrics]) -> str:
             charts.Series("joint", "c1", table.stated, table.true),
             charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
         ],
-        x_label="stated probability of contact",
+        x_label="estimated probability of contact",
         y_label="share of true contact",
         x_range=(0, 1),
         y_range=(0, 1),
@@ -206,9 +215,10 @@ def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
 
 
 def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:
-    """Return rows of distances to the clouds, millimetres: measured, noise floor, published.
+    """Return rows of distances to the clouds, millimetres: measured, and references.
 
-    The noise floor is the distance of the true surfaces to the clouds.
+    The reference is the distance of the true surfaces, or the published figure of real recordings
+    if no sequence is virtual.
     """
     names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
     measured = figures.cloud_figures(sequences)
@@ -216,9 +226,10 @@ def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str,
     rows = [{"name": dataset, "cells": [measured[n] for n in names], "reference": False}]
     if floor:
         cells = [floor.get(n) for n in names]
-        rows.append({"name": "floor: true poses", "cells": cells, "reference": True})
-    published = [*_PUBLISHED_CLOUD_MM, None, None]
-    rows.append({"name": "InterCap, as published", "cells": published, "reference": True})
+        rows.append({"name": "true poses", "cells": cells, "reference": True})
+    if not any(s.has_truth for s in sequences):
+        published = [*_PUBLISHED_CLOUD_MM, None, None]
+        rows.append({"name": "InterCap, as published", "cells": published, "reference": True})
     return rows
 
 
@@ -297,8 +308,17 @@ def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, 
             if s.name in shown
             for held in held_out_cameras(s)
         ],
-        "figures": verdict_figures(judged) or None,
+        "covered": covered(judged),
     }
+
+
+def covered(sequences: Sequence[SequenceMetrics]) -> list[tuple[str, int, int]]:
+    """Return part, number of true errors inside the estimated range, and number of both known."""
+    known: dict[str, list[bool]] = {}
+    for error in (e for s in sequences for e in stated_errors(s)):
+        if np.isfinite(error.stated) and np.isfinite(error.true):
+            known.setdefault(error.part, []).append(error.covers)
+    return [(part, sum(inside), len(inside)) for part, inside in known.items()]
 
 
 def _row(name: str, parts: Sequence[str], errors: Sequence[StatedError]) -> dict[str, Any]:
@@ -313,9 +333,14 @@ def _row(name: str, parts: Sequence[str], errors: Sequence[StatedError]) -> dict
 
 def _cell(error: StatedError | None) -> dict[str, Any]:
     if error is None:
-        return {"stated": None, "range": "", "true": None, "repeated": None}
+        return {"stated": None, "range": "", "true": None, "repeated": None, "outside": False}
     known = {"true": error.true, "repeated": error.repeated}
     if not np.isfinite(error.stated):
-        return {"stated": None, "range": "", **known}
-    low, high = error.stated / error.factor, error.stated * error.factor
-    return {"stated": error.stated, "range": f"{low:.1f}–{high:.1f}", **known}
+        return {"stated": None, "range": "", "outside": False, **known}
+    outside = bool(np.isfinite(error.true)) and not error.covers
+    return {"stated": error.stated, "range": error_range(error), "outside": outside, **known}
+
+
+def error_range(error: StatedError) -> str:
+    """Format the range of an estimated error, millimetres."""
+    return f"{error.stated / error.factor:.1f}–{error.stated * error.factor:.1f}"

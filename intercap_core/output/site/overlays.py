@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -126,35 +126,52 @@ def overlays(
     Args:
         images: images by the frame that they show (:meth:`Frames.showing`).
     """
-    result = []
     posed = {t: fit.at(t) for t in frames}
-    for c in cameras:
-        camera = rig[c]
-        window = _window(camera, [mesh for meshes in posed.values() for mesh in meshes])
-        if window is None:
+    return [
+        Overlay(rig[c].name, t, encode_jpeg(picture))
+        for c in cameras
+        for t, picture in draw_over(images, rig, c, posed, rows=420).items()
+    ]
+
+
+def draw_over(
+    images: Frames, rig: Rig, c: int, posed: Mapping[int, Sequence[PosedMesh]], *, rows: int
+) -> dict[int, np.ndarray]:
+    """Draw meshes over the images of camera ``c``, cropped to the part that shows all of them.
+
+    Args:
+        images: images by the frame that they show (:meth:`Frames.showing`).
+        posed: meshes by frame.
+        rows: largest height of a picture, pixels.
+
+    Returns:
+        RGB pictures (H, W, 3) in 0..1 by frame, all of one size; missing images are left out.
+    """
+    camera = rig[c]
+    window = _window(camera, [mesh for meshes in posed.values() for mesh in meshes])
+    if window is None:
+        return {}
+    x0, y0, width, height = window
+    lens = camera.colour.cropped(x0, y0, width, height).scaled(min(1.0, rows / height))
+    pictures = {}
+    for t, meshes in posed.items():
+        image = images.colour(t, c)
+        if image is None:
             continue
-        x0, y0, width, height = window
-        scale = min(1.0, 420 / height)  # pictures of at most 420 rows
-        lens = camera.colour.cropped(x0, y0, width, height).scaled(scale)
-        for t, meshes in posed.items():
-            image = images.colour(t, c)
-            if image is None:
-                continue
-            crop = image[y0 : y0 + height, x0 : x0 + width]
-            crop = cv2.resize(crop, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-            coloured = [
-                ColouredMesh(
-                    m.vertices,
-                    m.faces,
-                    np.broadcast_to(np.array(m.colour), m.vertices.shape),
-                    camera.colour_from_master @ m.master_from_mesh,
-                )
-                for m in meshes
-            ]
-            picture = draw(coloured, lens)
-            blended = picture.over(crop[..., ::-1] / np.float32(255), opacity=0.62)
-            result.append(Overlay(camera.name, t, encode_jpeg(blended)))
-    return result
+        crop = image[y0 : y0 + height, x0 : x0 + width]
+        crop = cv2.resize(crop, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+        coloured = [
+            ColouredMesh(
+                m.vertices,
+                m.faces,
+                np.broadcast_to(np.array(m.colour), m.vertices.shape),
+                camera.colour_from_master @ m.master_from_mesh,
+            )
+            for m in meshes
+        ]
+        picture = draw(coloured, lens)
+        pictures[t] = picture.over(crop[..., ::-1] / np.float32(255), opacity=0.62)
+    return pictures
 
 
 def _window(camera: Camera, meshes: Sequence[PosedMesh]) -> tuple[int, int, int, int] | None:

@@ -17,6 +17,7 @@ from intercap_core.output.site import measures
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
+from intercap_core.output.site.preview import PREVIEW
 from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
@@ -29,9 +30,9 @@ _FIGURES = {
     "penetration.p98_mm": ("penetration", "p98, mm"),
     "vertex_to_cloud.body_visible_mm": ("body to cloud", "visible, mm"),
     "vertex_to_cloud.object_visible_mm": ("object to cloud", "visible, mm"),
-    "verdict.body_mm": ("body", "stated, mm"),
-    "verdict.hands_mm": ("hands", "stated, mm"),
-    "verdict.object_mm": ("object", "stated, mm"),
+    "verdict.body_mm": ("body", "est. error, mm"),
+    "verdict.hands_mm": ("hands", "est. error, mm"),
+    "verdict.object_mm": ("object", "est. error, mm"),
     "joint.body_pve_mm": ("body PVE", "mm, truth"),
     "joint.hand_mpjpe_mm": ("hands", "mm, truth"),
     "joint.object_translation_mm": ("object", "mm, truth"),
@@ -105,6 +106,7 @@ def page(content: DatasetContent) -> str:
     context = {
         "dataset": content.dataset,
         "headline": _headline(content, measured),
+        "virtual": sum(s.has_truth for s in measured),
         "tiles": _tiles(measured),
         "rows": sorted(rows, key=lambda row: row["rank"]),
         "filters": {
@@ -161,15 +163,21 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     if any(s.has_truth for s in measured):
         joint = figures.truth_figures(measured, "joint")
         for key, name, unit, note in (
-            ("body_pve_mm", "body error", "mm", "per vertex, against truth"),
-            ("object_translation_mm", "object error", "mm", "centre, median, against truth"),
-            ("object_rotation_deg", "object rotation error", "°", "median, against truth"),
-            ("contact_region_f1", "contact", "", "F1 by body region"),
+            ("body_pve_mm", "body error", "mm", "mean over vertices, against truth"),
+            ("object_translation_mm", "object error", "mm", "median of the centre"),
+            ("object_rotation_deg", "object rotation error", "°", "median"),
+            ("contact_region_f1", "contact, F1 by region", "", "of the body, against truth"),
+            ("contact_f1", "contact, F1 by vertex", "", "at 4.5 mm, against truth"),
         ):
             if key in joint:
-                tiles.append(tile(name, joint[key], unit, note, 2 if unit in ("", "°") else 1))
+                worst = _worst_object(measured, key, unit) if key.startswith("object") else ""
+                tiles.append(
+                    tile(name, joint[key], unit, note + worst, 2 if unit in ("", "°") else 1)
+                )
+    inside = {part: f"; {n} of {all_} true errors in range"
+              for part, n, all_ in measures.covered(measured)}  # fmt: skip
     tiles += [
-        tile(f"{part}, stated", value, "mm", "mean error, without truth")
+        tile(f"{part}, estimated error", value, "mm", f"no ground truth{inside.get(part, '')}")
         for part, value in mean_stated(measured).items()
     ]
     handling = any(s.has_object for s in measured)
@@ -182,6 +190,21 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     return [*tiles, tile("flagged", share, "%", f"{count:,} frames not trusted")]
 
 
+def _worst_object(measured: Sequence[SequenceMetrics], key: str, unit: str) -> str:
+    """Return name and value of the object with the largest error; "" if there is only one."""
+    by_object: dict[str, list[SequenceMetrics]] = {}
+    for s in measured:
+        if s.has_truth and s.has_object:
+            by_object.setdefault(s.object_, []).append(s)
+    errors = {name: figures.truth_figures(some, "joint").get(key, np.inf)
+              for name, some in by_object.items()}  # fmt: skip
+    if len(errors) < 2:
+        return ""
+    worst = max(errors, key=lambda name: errors[name])
+    value = f"{errors[worst]:.{2 if unit == '°' else 1}f}{'' if unit == '°' else ' '}{unit}"
+    return f"; worst: {worst}, {value if np.isfinite(errors[worst]) else 'lost'}"
+
+
 def _rows(content: DatasetContent) -> list[dict[Hashable, Any]]:
     """Return the records of the table of sequences with percentages and addresses of pages."""
     return [
@@ -190,6 +213,7 @@ def _rows(content: DatasetContent) -> list[dict[Hashable, Any]]:
             "flagged": 100 * record["flagged_frames"] / record["frames"],
             "contact": 100 * record["contact_frames"] / record["frames"],
             "page": content.page_of[record["sequence"]],
+            "preview": content.page_of[record["sequence"]].replace("index.html", PREVIEW),
         }
         for record in content.table.to_dict("records")
     ]

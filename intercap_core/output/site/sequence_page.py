@@ -17,6 +17,7 @@ from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.output.site.preview import Preview
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
@@ -31,6 +32,8 @@ class SequenceContent:
     """Instruction to the person, "" if not stated."""
     overlays: Sequence[Overlay]
     """In the order of cameras."""
+    preview: Preview | None
+    """Animation at the top of the page; None without images."""
     note: str
     """Why there are no overlays."""
     joint: str
@@ -83,6 +86,7 @@ def page(content: SequenceContent) -> str:
         "joint": content.joint,
         "cameras": list(cameras.values()),
         "note": content.note,
+        "preview": _preview(content.preview),
         "closeups": [embedded(picture) for picture in content.closeups],
         "capture": content.capture
         | {"pictures": [[embedded(p) for p in row] for row in content.capture["pictures"]]},
@@ -98,22 +102,34 @@ def page(content: SequenceContent) -> str:
     return render("sequence.html.j2", context)
 
 
+def _preview(preview: Preview | None) -> dict[str, Any] | None:
+    if preview is None:
+        return None
+    caption = f"Result over the images of camera {preview.camera}"
+    return {
+        "animation": embedded(preview.animation, caption),
+        "still": embedded(preview.still, caption),
+    }
+
+
 def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
     tiles = [
         tile(
-            f"{error.part}, stated",
+            f"{error.part}, estimated error",
             error.stated,
             "mm",
-            error.silent or f"four of five are within a factor of {error.factor:.1f}",
+            error.silent or f"no ground truth; range {measures.error_range(error)} mm",
         )
         for error in stated_errors(s)
     ]
     if s.has_truth:
         errors = figures.truth_figures([s], "joint")
-        tiles.append(tile("body", errors.get("body_pve_mm"), "mm", "per vertex, against truth"))
+        tiles.append(
+            tile("body error", errors.get("body_pve_mm"), "mm", "per vertex, against truth")
+        )
         if s.has_object:
             centre = errors.get("object_translation_mm")
-            tiles.append(tile("object", centre, "mm", "centre, median, against truth"))
+            tiles.append(tile("object error", centre, "mm", "centre, median, against truth"))
     cloud = figures.cloud_figures([s])
     tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if s.has_object:
@@ -161,7 +177,7 @@ def _rows(
                 (a, b, "hover", f"{span(a, b)}: {100 * stated[a : b + 1].mean():.0f} %")
                 for a, b, _, _ in _runs(stated >= 0.5)
             ]
-            rows.append(charts.TimelineRow(f"{label}, stated", runs, levels=stated))
+            rows.append(charts.TimelineRow(f"{label}, estimated", runs, levels=stated))
         if touching.any():
             rows.append(charts.TimelineRow(f"{label}, meshes", _runs(touching)))
     return rows
@@ -193,8 +209,8 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
             (str(part), colour, 1e3 * s.values["verdict/error_frame"][p].astype(np.float64))
             for p, (part, colour) in enumerate(parts)
         ]
-        caption = "Error that the verdict states, by frame; no line where it states none."
-        residuals.append(_chart(lines, "stated error, mm", caption))
+        caption = "Estimated error (no ground truth) by frame; no line where there is no estimate."
+        residuals.append(_chart(lines, "estimated error, mm", caption))
     return [pair for pair in residuals if pair is not None]
 
 

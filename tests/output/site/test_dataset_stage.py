@@ -147,7 +147,11 @@ def test_pages_need_nothing_beside_the_site(
             if not address.startswith(("data:", "#")):
                 target = (folder / address.partition("#")[0]).resolve()
                 assert target.is_relative_to((site / "site").resolve()) and target.is_file()
-        for image in shown.images[:-1]:  # the last one is the empty enlargement
+        thumbnails = [image for image in shown.images if image.get("class") == "thumbnail"]
+        assert len(thumbnails) == (len(pages) if shown is overview else 0)
+        assert all((folder / str(image["src"])).is_file() for image in thumbnails)
+        # the last one is the empty enlargement
+        for image in (other for other in shown.images[:-1] if other not in thumbnails):
             assert image["alt"]
             data = base64.b64decode(str(image["src"]).split(";base64,")[1])
             shape = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape
@@ -162,14 +166,20 @@ def test_pages_show_overlays_flags_and_failures(
     text = " ".join(" ".join(overview.text).split())
     captions = [str(image["alt"]) for image in overview.images]
     assert {"front", "back", "left hand, palm", "right hand, back", "one side"} <= set(captions)
-    for part in (FAILED["s03_o01"], "object lost", "Against truth", "InterCap, as published"):
+    for part in (FAILED["s03_o01"], "object lost", "Against truth", "virtual recordings"):
         assert part in text
+    assert "as published" not in text  # a figure of real recordings
     for name, shown in pages.items():
         captions = [str(image["alt"]) for image in shown.images]
         assert sum(c.startswith("camera ") for c in captions) == 3 * 4  # cameras, frames
         assert sum(c.startswith(f"{name}, frame ") for c in captions) == 6  # two sides, one slice
         text = " ".join(" ".join(shown.text).split())
-        for part in ("Over time", "Verdict", "Joint fit", "before (grey) and after (blue)"):
+        for part in (
+            "Over time",
+            "Estimated error (no ground truth)",
+            "Joint fit",
+            "before (grey) and after (blue)",
+        ):
             assert part in text
     ball_captions = [str(image["alt"]) for image in pages["s01_o03"].images]
     assert [c for c in ball_captions if " hand, frames " in c] == [

@@ -50,6 +50,13 @@ for (const form of document.querySelectorAll("form.filters")) {
   update();
 }
 
+/* Thumbnails of sequences whose page has no picture are removed. */
+for (const image of document.querySelectorAll(".thumbnail")) {
+  const drop = () => image.remove();
+  if (image.complete && !image.naturalWidth) drop();
+  else image.addEventListener("error", drop);
+}
+
 /* Give areas a tab stop only while they can be scrolled. */
 const observer = new ResizeObserver((entries) => {
   for (const { target } of entries) {
