@@ -14,7 +14,7 @@ Shapes are the same for both stages.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -27,6 +27,7 @@ from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
+from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.motion import z_up_frame
@@ -46,8 +47,8 @@ class Moment:
     """(55, 3) joints of the body, metres."""
     object_: np.ndarray
     """(Vo, 3) vertices of the object, metres; (0, 3) without an object."""
-    trusted: bool
-    """True if the frame is not flagged."""
+    trusted: Mapping[str, bool]
+    """Whether body, hands, object and contact are not flagged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +69,9 @@ class PosedSequence:
     """(4, 4) transform to the coordinate frame of the results."""
     times: np.ndarray
     """(T,) times, seconds."""
-    trusted: np.ndarray
-    """(T,) bool, False for flagged frames."""
+    trusted: Mapping[str, np.ndarray]
+    """Mask (T,) of the frames without a flag, by part: body, hands, object and contact. Without an
+    object there are the first two; body_fit has body and object."""
     frame: str
     """Description of the coordinate frame; for z-up with the source of the up direction."""
 
@@ -87,7 +89,8 @@ class PosedSequence:
             raise IndexError(f"frame {frame} of {len(self)}")
         one = [frame % len(self)]
         vertices, joints = self.bodies(one)
-        return Moment(vertices[0], joints[0], self.objects(one)[0], bool(self.trusted[frame]))
+        trusted = {part: bool(mask[frame]) for part, mask in self.trusted.items()}
+        return Moment(vertices[0], joints[0], self.objects(one)[0], trusted)
 
     def bodies(self, frames: slice | Sequence[int] = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (N, V, 3) and joints (N, 55, 3) of the chosen frames, metres."""
@@ -140,14 +143,16 @@ def open_sequence(
         parameters = read_parameters(body)
         if stage == "joint":
             rotation, translation = body["rotation"], body["translation"]
-            trusted, cameras = ~body["flagged"], body["master_from_colour"]
+            trusted = dict(zip(PARTS, ~body["flagged"].T, strict=True))
+            cameras = body["master_from_colour"]
         else:
-            trusted = ~(body["failed"] | body["uncertain"])
+            trusted = {"body": ~(body["failed"] | body["uncertain"])}
     if stage != "joint":
         with artefacts.read(project.artefact(sequence, "object_track"), OBJECT_TRACK) as track:
             rotation, translation = track["rotation"], track["translation"]
-            if mesh is not None:
-                trusted &= ~track["lost"]
+            trusted["object"] = ~track["lost"]
+    if mesh is None:
+        trusted = {part: mask for part, mask in trusted.items() if part not in OF_OBJECT}
     return PosedSequence(
         model,
         parameters,

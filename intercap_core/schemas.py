@@ -48,6 +48,10 @@ _CAMERA_MODELS = {
 _CAMERA_COVARIANCE = {
     "camera_covariance": Field(("C", "7", "C", "7"), "float64", "covariance of each camera's rotation about its centre, translation and depth bias; 0 for the master's pose", "rad, m", "master"),
 }  # fmt: skip
+_FLAGS = {
+    "flagged": Field(("T", "4"), "bool", "body, hands, object and contact of this frame are not reliable"),
+    "flag_reason": Field(("T",), "str", "reasons of all parts in words; empty = no part is flagged"),
+}  # fmt: skip
 _OBJECT_POSE = {
     "rotation": Field(("T", "3", "3"), "float64", "rotation of master_from_object; NaN in all frames = no object", "1", "master"),
     "translation": Field(("T", "3"), "float64", "translation of master_from_object (position of the mesh's origin)", "m", "master"),
@@ -328,7 +332,7 @@ BODY_FIT = Schema(
 
 JOINT = Schema(
     name="joint",
-    version=4,
+    version=5,
     stage="joint",
     attributes={
         "sequence": "sequence name",
@@ -379,10 +383,9 @@ JOINT = Schema(
         "hand_undetermined": Field(
             ("T", "2"),
             "bool",
-            "left and right hand: the deviation of its finger joints is above 13 mm, also with the frames around; the frame is not flagged for this reason",
+            "left and right hand: the deviation of its finger joints is above 13 mm, also with the frames around",
         ),
-        "flagged": Field(("T",), "bool", "body or object of this frame are not reliable"),
-        "flag_reason": Field(("T",), "str", "reasons in words; empty = not flagged"),
+        **_FLAGS,
         "surface_distance": Field(
             ("T", "2"),
             "float64",
@@ -475,7 +478,7 @@ _PER_STAGE_TRUTH = {
 # Object and contact datasets are absent in recordings without an object.
 METRICS = Schema(
     name="metrics",
-    version=5,
+    version=6,
     stage="metrics",
     attributes={
         "sequence": "sequence name",
@@ -510,8 +513,7 @@ METRICS = Schema(
         "cloud_to_body": Field(("T",), "float32", "mean distance of the person's points to the body, each capped at 0.25", "m"),
         "acceleration_body": Field(("T",), "float32", "norm of second differences at 30 fps, mean over 22 joints", "m/frame^2"),
         "acceleration_object": Field(("T",), "float32", "the same at the object's centre", "m/frame^2", optional=True),
-        "flagged": Field(("T",), "bool", "a stage flags this frame"),
-        "flag_reason": Field(("T",), "str", "reasons in words; empty = not flagged"),
+        **_FLAGS,
         "verdict/part_names": Field(("P",), "str", "parts whose error is estimated without truth", optional=True),
         "verdict/error": Field(("P",), "float64", "estimated error of each part; NaN = not estimated", "m", optional=True),
         "verdict/error_factor": Field(("P",), "float64", "factor around verdict/error that contains four of five true errors", optional=True),
@@ -559,7 +561,7 @@ PER_VERTEX_METRICS = frozenset(
 # Input of the dataset's statistics: the metrics without distances by vertex.
 SUMMARY = Schema(
     name="summary",
-    version=1,
+    version=2,
     stage="summary",
     frame="none: values by frame, and on meshes in rest pose",
     attributes={

@@ -41,7 +41,9 @@ def test_points_match_the_artefacts(capture, settings, stage, share):
     moment = found.at(-1)
     np.testing.assert_allclose(moment.body, vertices[4], atol=1e-6)
     np.testing.assert_array_equal(moment.object_, found.objects([4])[0])
-    assert moment.trusted
+    assert all(moment.trusted.values())
+    first = found.at(0).trusted  # its object is lost
+    assert first["body"] and not first["object"]
     np.testing.assert_allclose(found.bodies(slice(1, 5, 2))[1], joints[1:5:2], atol=1e-6)
     with pytest.raises(IndexError, match="frame 5 of 5"):
         found.at(5)

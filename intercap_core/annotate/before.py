@@ -21,6 +21,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
+from intercap_core.flags import PARTS
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, OBJECT_TRACK
 from intercap_core.stage_list import SEQUENCE_STAGES
@@ -128,7 +129,8 @@ def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
             rows[f"{error.part}, estimated error, mm"] = (
                 None if stated is None else round(stated, 1)
             )
-        rows["flagged frames"] = int(metrics.values["flagged"].sum())
+        flagged = metrics.values["flagged"].sum(axis=0)
+        rows |= {f"frames with a flag, {p}": int(n) for p, n in zip(PARTS, flagged, strict=True)}
         if metrics.has_object:
             rows["frames in contact"] = int(metrics.values["contact_frame"].sum())
             depth = metrics.values["penetration_mean"]

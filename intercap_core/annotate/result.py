@@ -18,6 +18,7 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges, runs
+from intercap_core.flags import Flags
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -240,7 +241,7 @@ def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
                 "probability": _bytes(probability),
                 "annotated": bool((joint["contact_annotated"] >= 0).any()),
             }
-        info["flags"] = ranges(joint.text("flag_reason"))
+        info["flags"] = ranges(Flags.read(joint).texts())
         moved = joint["master_from_colour"]
     if opened.has("scene"):
         return Rig.from_scene(opened.paths["scene"]).moved(moved)
@@ -250,7 +251,7 @@ def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
 def _metrics(opened: Opened, info: dict[str, Any]) -> None:
     """Add flags and stated errors, and places with flags or large stated errors."""
     with artefacts.read(opened.paths["metrics"], METRICS) as metrics:
-        info["flags"] = ranges(metrics.text("flag_reason"))
+        info["flags"] = ranges(Flags.read(metrics).texts())
         if "verdict/error" in metrics:
             parts = metrics.text("verdict/part_names")
             error, by_frame = metrics["verdict/error"], metrics["verdict/error_frame"]

@@ -24,24 +24,17 @@ class Remarks:
 
     sequence: str
     """Name of the sequence."""
-    flagged: int
-    """Number of flagged frames."""
-    frames: int
-    """Number of frames; 0 without metrics."""
+    share: float
+    """Share of flagged frames, mean over the parts; 0 without metrics."""
     texts: tuple[str, ...]
     """Remarks, each beginning with its stage."""
-
-    @property
-    def share(self) -> float:
-        """Share of flagged frames."""
-        return self.flagged / self.frames if self.frames else 0.0
 
 
 def remarks(project: Project) -> list[Remarks]:
     """Remarks of all sequences that have any, largest share of flagged frames first."""
     sequences = []
     for name in project.sequences:
-        flagged = frames = 0
+        share = 0.0
         texts: list[str] = []
         known: set[str] = set()
         for stage in STAGES:
@@ -56,14 +49,15 @@ def remarks(project: Project) -> list[Remarks]:
                 known.update(new)
                 texts += [f"{stage}: {text}" for text in new]
                 if stage == "metrics":
-                    flagged, frames, reasons = outcome.flagged_frames(path)
+                    flags, reasons = outcome.flagged_frames(path)
+                    share = float(flags.flagged.mean())
                     named = [f"{text} ({count})" for text, count in reasons[:4]]
                     if named:
-                        texts.insert(0, f"{flagged} of {frames} frames flagged: {'; '.join(named)}")
+                        texts.insert(0, f"{flags.summary()}: {'; '.join(named)}")
             except UserError as error:  # an artefact of an older version; the text says what to do
                 texts.append(str(error))
         if texts:
-            sequences.append(Remarks(name, flagged, frames, tuple(texts)))
+            sequences.append(Remarks(name, share, tuple(texts)))
     return sorted(sequences, key=lambda s: (-s.share, -len(s.texts), s.sequence))
 
 

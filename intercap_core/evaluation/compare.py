@@ -22,6 +22,7 @@ from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import stated_errors
+from intercap_core.flags import Flags
 from intercap_core.schemas import JOINT
 
 NAME, FRAME = "sequence", "frame"
@@ -186,8 +187,8 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
             "object_deg": turned,
             "touches": _named(regions, new & ~old),
             "touches_no_more": _named(regions, old & ~new),
-            "flag_before": before.text("flag_reason"),
-            "flag_after": after.text("flag_reason"),
+            "flag_before": Flags.read(before).texts(),
+            "flag_after": Flags.read(after).texts(),
         }
     )
 
@@ -208,7 +209,7 @@ def _measured(folder: Path, when: str) -> dict[str, object]:
         found = SequenceSummary.read(folder / "summary.h5").metrics
     except UserError:
         return {}
-    row: dict[str, object] = {f"flagged_{when}": int(found.values["flagged"].sum())}
+    row: dict[str, object] = {f"flagged_{when}": int(found.values["flagged"].any(axis=1).sum())}
     for error in stated_errors(found):
         row[f"stated_{error.part}_mm_{when}"] = error.stated
     return row

@@ -18,6 +18,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation import contact, object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
+from intercap_core.flags import PARTS, Flags
 from intercap_core.schemas import BAD_BODY_M, CONTACT_M, METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
 
@@ -78,6 +79,11 @@ class SequenceMetrics:
         return len(self.values["flagged"])
 
     @property
+    def flags(self) -> Flags:
+        """Flags by part."""
+        return Flags(self.values["flagged"], [str(r) for r in self.values["flag_reason"]])
+
+    @property
     def has_object(self) -> bool:
         """Whether the metrics have an object: one was recorded and found."""
         return "contact_frame" in self.values
@@ -87,6 +93,12 @@ def pooled(sequences: Sequence[SequenceMetrics], key: str) -> np.ndarray | None:
     """Dataset ``key`` of all sequences that have it, concatenated over frames; None if none has."""
     found = [s.values[key] for s in sequences if key in s.values]
     return np.concatenate(found) if found else None
+
+
+def pooled_flags(sequences: Sequence[SequenceMetrics]) -> Flags:
+    """Flags of all frames of one or more sequences."""
+    flagged = np.concatenate([s.flags.flagged for s in sequences])
+    return Flags(flagged, [reason for s in sequences for reason in s.flags.reasons])
 
 
 def finite_median(values: np.ndarray) -> float:
@@ -154,23 +166,27 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 
 
 def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """Recall and precision of the flags for the frames that are truly bad after ``joint``."""
-    flagged, bad = [], []
+    """Recall and precision of the flags for truly bad bodies and objects after ``joint``.
+
+    ``bad_frames`` is the share of frames whose body or object is bad.
+    """
+    flagged, bad, bad_frames = [], [], []
     for s in sequences:
         if not s.has_truth:
             continue
-        wrong = np.zeros(len(s), bool)
-        if "truth/joint/object_translation" in s.values:
-            wrong = _object_errors(s, "joint").lost
+        wrong = np.zeros((len(s), 2), bool)
         if "truth/joint/body_pve" in s.values:
-            wrong = wrong | (s.values["truth/joint/body_pve"] > BAD_BODY_M)
-        flagged.append(s.values["flagged"])
-        bad.append(wrong)
+            wrong[:, 0] = s.values["truth/joint/body_pve"] > BAD_BODY_M
+        if "truth/joint/object_translation" in s.values:
+            wrong[:, 1] = _object_errors(s, "joint").lost
+        flagged.append(s.values["flagged"][:, np.isin(PARTS, ["body", "object"])].ravel())
+        bad.append(wrong.ravel())
+        bad_frames.append(wrong.any(axis=1))
     if not bad:
         return {}
     found, true = np.concatenate(flagged), np.concatenate(bad)
     return {
-        "bad_frames": float(true.mean()),
+        "bad_frames": float(np.concatenate(bad_frames).mean()),
         "flag_recall": contact.recall(found, true),
         "flag_precision": contact.precision(found, true),
     }

@@ -1,4 +1,4 @@
-"""Reasons for unreliable frames, and detection of limbs whose left and right are exchanged."""
+"""Runs of frames with the same flag, and detection of limbs whose left and right are exchanged."""
 
 from __future__ import annotations
 
@@ -7,15 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-
-
-def merge_reasons(sources: Sequence[tuple[np.ndarray, str]]) -> list[str]:
-    """Reasons of each of T frames, joined by "; "; "" = reliable.
-
-    ``sources``: pairs of a mask (T,) and the reason for its frames.
-    """
-    frames = len(sources[0][0])
-    return ["; ".join(reason for mask, reason in sources if mask[t]) for t in range(frames)]
 
 
 def ranges(reasons: Sequence[str]) -> list[tuple[int, int, str]]:

@@ -15,6 +15,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyModels
+from intercap_core.flags import PARTS
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK
 
 _TIPS = [
@@ -83,8 +84,10 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
         parameters = read_parameters(artefact)
         first = stage == "body_fit"
         sigma = artefact["joint_sigma"] if first else None
-        flags = ("failed", "bridged", "uncertain") if first else ("flagged",)
-        flagged = np.any([artefact[flag] for flag in flags], axis=0)
+        if first:
+            flagged = artefact["failed"] | artefact["bridged"] | artefact["uncertain"]
+        else:
+            flagged = artefact["flagged"][:, PARTS.index("body")]
         model = load_model(body_models, gender, artefact)
     with torch.no_grad():
         ids = model.keypoint_map.vertex_ids
@@ -100,10 +103,13 @@ def read_object(path: Path, stage: str) -> ObjectTrack:
     """
     with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
         first = stage == "object_track"
-        flags = ("lost", "ambiguous") if first else ("flagged",)
+        if first:
+            flagged = artefact["lost"] | artefact["ambiguous"]
+        else:
+            flagged = artefact["flagged"][:, PARTS.index("object")]
         return ObjectTrack(
             artefact["rotation"],
             artefact["translation"],
-            np.any([artefact[flag] for flag in flags], axis=0),
+            flagged,
             artefact["covariance"] if first else None,
         )

@@ -15,7 +15,7 @@ A sequence's parameters are in ``smpl_fit_all.npz`` (``poses``, ``frame_times``)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +25,7 @@ import numpy as np
 from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.flags import Flags
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
@@ -77,8 +78,8 @@ class Results:
     """(T, 3) of master_from_object; NaN without an object."""
     source: str
     """Description of the results, for the user."""
-    reasons: Sequence[str] = ()
-    """(T,) why a frame has no result or is not trusted, "" = no reason; () = no frame has one."""
+    flags: Flags | None = None
+    """Frames without a result or not to be trusted; None = frames that are not finite."""
     surface_distance: np.ndarray | None = None
     """(T, 2) mean and 95th percentile, metres, of the distance between the converted and the
     released body surface; None if the body was not converted."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from intercap_core.annotation import ContactInterval
 from intercap_core.config import JointSettings
+from intercap_core.flags import OF_BODY, OF_OBJECT, PARTS, Cause, Flags
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.contact_estimate import ContactEstimate, estimate_contact
 from intercap_core.joint.floor import contradiction
@@ -145,7 +146,7 @@ def fit(
         steps=rounds.steps,
         refused=rounds.refused,
         convergence=convergence,
-        flag_reasons=_flag_reasons(
+        flags=_flags(
             inputs, state, rounds.estimate, stalled, against_images, assembly.against_floor
         ),
         cameras_corrected=cameras is not None and not cameras.refused,
@@ -246,23 +247,23 @@ def _displacement(geometry: Geometry, before: State, after: State) -> float:
     return float(np.percentile(np.fmax(skin.mean(axis=1), centre), 95))
 
 
-def _flag_reasons(
+def _flags(
     inputs: JointInputs,
     state: State,
     estimate: ContactEstimate,
     stalled: np.ndarray,
     against_images: np.ndarray,
     against_floor: str,
-) -> list[str]:
-    """Reasons (T,) not to trust a frame; "" if there is none.
+) -> Flags:
+    """Flags of all frames. Only poses that were measured are flagged for penetration.
 
     Args:
         stalled: (T,) frames that no step moved.
         against_images: (T,) frames whose images contradict the object's final pose.
         against_floor: why the floor is not used.
     """
-    flags = inputs.sequential.flags
-    deep = sunk = np.zeros(len(state), bool)
+    flags, every = inputs.sequential.flags, np.ones(len(state), bool)
+    deep = sunk = ~every
     lost = "object found in no frame"
     if inputs.geometry.has_object:
         posed = inputs.geometry.at(state)
@@ -270,17 +271,24 @@ def _flag_reasons(
         deep = posed.proximity.distance.min(axis=1) < -limit
         sunk = posed.object_depth(inputs.threads) > limit
         lost = "object lost, filled in"
-    causes = (
-        (flags.filled, "body not seen well enough, filled in"),
-        (flags.uncertain, "body not determined by what was seen"),
-        (flags.lost, lost),
-        (flags.ambiguous & flags.carried, CARRIED),
-        (flags.ambiguous & ~flags.carried, "object pose ambiguous"),
-        (deep, BODY_INSIDE),
-        (sunk, OBJECT_INSIDE),
-        *estimate.doubtful_frames(),
-        (stalled, "no step of the joint fit lowered its energy"),
-        (against_images, CONTRADICTED),
-        (np.full(len(state), bool(against_floor)), against_floor),
-    )
-    return ["; ".join(text for frames, text in causes if frames[t]) for t in range(len(state))]
+    causes: list[Cause] = [
+        (flags.filled, "body not seen well enough, filled in", OF_BODY),
+        (flags.uncertain, "body not determined by what was seen", OF_BODY),
+        (flags.hands[:, 0], "left hand not determined by what was seen", ["hands"]),
+        (flags.hands[:, 1], "right hand not determined by what was seen", ["hands"]),
+        (flags.lost, lost, OF_OBJECT),
+        (flags.ambiguous & flags.carried, CARRIED, OF_OBJECT),
+        (flags.ambiguous & ~flags.carried, "object pose ambiguous", OF_OBJECT),
+    ]
+    for inside, reason in ((deep, BODY_INSIDE), (sunk, OBJECT_INSIDE)):
+        causes += [
+            (inside & ~flags.lost, reason, OF_BODY),
+            (inside & ~flags.filled, reason, OF_OBJECT),
+        ]
+    causes += [
+        *((frames, reason, ["contact"]) for frames, reason in estimate.doubtful_frames()),
+        (stalled, "no step of the joint fit lowered its energy", PARTS),
+        (against_images, CONTRADICTED, OF_OBJECT),
+        (every & bool(against_floor), against_floor, PARTS),
+    ]
+    return Flags.of(len(state), causes)

@@ -10,6 +10,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
+from intercap_core.flags import Flags
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.cameras import Cameras
 from intercap_core.joint.contact_estimate import ContactEstimate
@@ -48,7 +49,7 @@ class JointFit:
     steps: int  # Number of accepted steps
     refused: int  # Number of refused steps
     convergence: Convergence  # Outcome of the rounds
-    flag_reasons: list[str]  # (T,) reasons not to trust a frame; "" if there is none
+    flags: Flags  # Frames and parts not to be trusted
     cameras_corrected: bool  # Whether the cameras were corrected
     last_step_m: float  # Displacement by the last step, 95th percentile over frames, metres
     last_decrease: float  # Decrease of the energy by the last step, as a share of the energy
@@ -62,7 +63,6 @@ class JointResult:
     probability: np.ndarray  # (T, R) probability of contact
     annotated: np.ndarray  # (T, R) annotation: 1 touching, 0 free, -1 no label
     cameras: Cameras  # Corrected cameras
-    flagged: np.ndarray  # (T,) frames not to be trusted
     contradicted: np.ndarray  # (T,) frames whose images contradict the object's pose
     penetrating: np.ndarray  # (T,) frames in which body and object are deep inside each other
     camera_covariance: np.ndarray  # (C, 7, C, 7) of the cameras, see :mod:`.cameras`
@@ -85,7 +85,6 @@ class JointResult:
                 joint["contact_probability"].astype(float),
                 joint["contact_annotated"],
                 Cameras(rig, joint["depth_bias"]),
-                joint["flagged"],
                 np.array([CONTRADICTED in reason for reason in reasons]),
                 np.array([BODY_INSIDE in r or OBJECT_INSIDE in r for r in reasons]),
                 joint["camera_covariance"],

@@ -104,7 +104,7 @@ class SequentialFlags:
     lost: np.ndarray  # (T,) the sequence has an object and its track is lost
     ambiguous: np.ndarray  # (T,) different poses of the object explain the frame
     carried: np.ndarray  # (T,) the object's pose follows from annotated poses alone
-    hands: np.ndarray  # (T, 2) left, right hand is undetermined; flags no frame
+    hands: np.ndarray  # (T, 2) left, right hand is undetermined
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
+from intercap_core.flags import Flags
 from intercap_core.object_track.artefact import SOURCE_NONE as NO_TRACK
 
 _CHOSEN_BY = {
@@ -92,17 +93,17 @@ def notes(stage: str, path: Path) -> list[str]:
         return list(dict.fromkeys(found))
 
 
-def flagged_frames(metrics: Path) -> tuple[int, int, list[tuple[str, int]]]:
-    """Number of flagged frames and of all frames in a metrics artefact, and the reasons with their
-    number of frames, most frequent first."""
+def flagged_frames(metrics: Path) -> tuple[Flags, list[tuple[str, int]]]:
+    """Flags of a metrics artefact, and their reasons with the number of frames, most frequent
+    first."""
     with artefacts.read(metrics, schemas.METRICS) as artefact:
-        flagged, reasons = artefact["flagged"], artefact.text("flag_reason")
+        flags = Flags.read(artefact)
     counts: dict[str, int] = {}
-    for text in reasons:
+    for text in flags.reasons:
         for reason in dict.fromkeys(part.strip() for part in text.split(";") if part.strip()):
             counts[reason] = counts.get(reason, 0) + 1
     ordered = sorted(counts.items(), key=lambda item: -item[1])
-    return int(flagged.sum()), len(flagged), ordered
+    return flags, ordered
 
 
 def _frames(a: Artefact) -> str:
@@ -174,7 +175,7 @@ def _body_fit(a: Artefact) -> str:
 
 def _joint(a: Artefact) -> str:
     if "made_by" in a.attributes:
-        return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames are not flagged"
+        return f"made by {a.attributes['made_by']}; {Flags.read(a).summary()}"
     end = "converged" if a.attributes["converged"] else "iteration limit reached"
     if "last_step_mm" in a.attributes:
         end += f" (last step {a.attributes['last_step_mm']:.2g} mm)"
@@ -184,8 +185,7 @@ def _joint(a: Artefact) -> str:
         contact = "the body alone, without an object"
     return (
         f"{a.attributes['iterations']} steps, {a.attributes['refused']} refused, {end}; "
-        f"{contact}, "
-        f"{int(a['flagged'].sum())} not trusted"
+        f"{contact}; {Flags.read(a).summary()}"
     )
 
 
@@ -201,12 +201,11 @@ def _metrics(a: Artefact) -> str:
             if np.isfinite(e)
         ]
     errors = f"estimated errors: {', '.join(parts)}; " if parts else ""
-    return f"{errors}{_share(a['flagged'])} frames flagged"
+    return f"{errors}{Flags.read(a).summary()}"
 
 
 def _summary(summary: Artefact) -> str:
-    flagged = summary["flagged"]
-    words = f"{len(flagged)} frames, {int(flagged.sum())} flagged"
+    words = Flags.read(summary).summary()
     if "contact_frame" in summary:
         words += f", {_share(summary['contact_frame'])} in contact"
     return words

@@ -137,7 +137,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
     return About(
         motion.sequence,
         ExportBody.of(motion.model, motion.gender),
-        [str(reason) for reason in measured.values["flag_reason"]],
+        measured.flags,
         None if mesh is None else StatedContact.read(paths.joint),
         Verdict.of(measured),
         None if mesh is None else ContactVertices.read(paths.metrics, motion, mesh),

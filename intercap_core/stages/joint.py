@@ -99,5 +99,4 @@ def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:
     writer.put("energy_names", names)
     writer.put("energy_before", [before.get(name, 0.0) for name in names])
     writer.put("energy_after", [after.get(name, 0.0) for name in names])
-    writer.put("flagged", np.array([bool(reason) for reason in fitted.flag_reasons]))
-    writer.put("flag_reason", fitted.flag_reasons)
+    fitted.flags.write(writer)

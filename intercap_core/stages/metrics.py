@@ -13,22 +13,20 @@ from intercap_core.body.joints import BODY_JOINTS
 from intercap_core.config import MetricsSettings, digest
 from intercap_core.evaluation import motion, object_pose
 from intercap_core.evaluation import truth as truths
-from intercap_core.evaluation.flags import exchanged, merge_reasons
+from intercap_core.evaluation.flags import exchanged
 from intercap_core.evaluation.measurement import HandledObject, Measurement, Values
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.segmented import read_clouds
 from intercap_core.evaluation.stage_errors import StageErrors
 from intercap_core.evaluation.tracks import BodyTrack, read_body, read_object
 from intercap_core.evaluation.verdict.judge import reach_verdict
+from intercap_core.flags import OF_BODY, PARTS, Cause, Flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.joint.result import CARRIED
 from intercap_core.schemas import (
-    BODY_FIT,
     JOINT,
     METRICS,
-    OBJECT_TRACK,
     PERSON,
     SCENE,
 )
@@ -83,7 +81,7 @@ def run(
         true_facing = values.pop("true_facing", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
-        values |= _flags(images, paths)
+        flags = _flags(images, paths)
         if handled is not None:
             values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
@@ -117,6 +115,7 @@ def run(
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
             writer.put(key, values[key])
+        flags.write(writer)
         for key in sorted(verdict):
             writer.put(f"verdict/{key}", verdict[key])
 
@@ -132,42 +131,22 @@ def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) ->
     return values
 
 
-def _flags(images: Frames, paths: SequencePaths) -> Values:
-    """Mask ``flagged`` (T,) of the frames that any stage marks as unreliable, and their reasons."""
+def _flags(images: Frames, paths: SequencePaths) -> Flags:
+    """Flags of the joint result, and those of missing images and of exchanged sides."""
     with artefacts.read(paths.person, PERSON) as artefact:
         missing = artefact["missing"]
-    with artefacts.read(paths.object_track, OBJECT_TRACK) as artefact:
-        named = bool(artefact.attributes["object"])
-        lost, ambiguous = artefact["lost"] & named, artefact["ambiguous"]
-        carried = artefact["carried"] if "carried" in artefact else np.zeros_like(lost)
-    with artefacts.read(paths.body_fit, BODY_FIT) as artefact:
-        failed, bridged = artefact["failed"], artefact["bridged"]
-        uncertain = artefact["uncertain"]
     with artefacts.read(paths.joint, JOINT) as artefact:
-        joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
-        joints = artefact["joints"]
+        of_joint, joints = Flags.read(artefact), artefact["joints"]
     unseen = np.asarray(~images.available.any(1))
-    alone = ~joint_flags  # the reasons of the joint stage include those of the earlier stages
-    reasons = merge_reasons(
-        [
-            (unseen, "no images"),
-            (missing & ~unseen, "person seen in fewer than two views, without depth"),
-            (lost & alone, "object lost"),
-            (ambiguous & carried & alone, CARRIED),
-            (ambiguous & ~lost & ~carried & alone, "object pose ambiguous"),
-            (failed & alone, "body fit failed"),
-            (bridged & ~failed & alone, "body filled in from neighbouring frames"),
-            (uncertain & alone, "body not determined by what was seen"),
-            *(
-                (frames, f"left and right of the {limb} may be exchanged: they jump there and back")
-                for limb, frames in exchanged(joints).items()
-            ),
-        ]
-    )
-    for t in np.flatnonzero(joint_flags):
-        reason = joint_reasons[t] or "joint fit not trusted"
-        reasons[t] = f"{reasons[t]}; {reason}" if reasons[t] else reason
-    return {"flagged": np.array([bool(r) for r in reasons]), "flag_reason": reasons}
+    swapped = exchanged(joints)
+    text = "left and right of the {} may be exchanged: they jump there and back"
+    causes: list[Cause] = [
+        (unseen, "no images", PARTS),
+        (missing & ~unseen, "person seen in fewer than two views, without depth", OF_BODY),
+        (swapped["legs"], text.format("legs"), ["body"]),
+        (swapped["arms"], text.format("arms"), OF_BODY),
+    ]
+    return Flags.of(len(joints), causes) | of_joint
 
 
 def _extrinsics_errors(

@@ -18,6 +18,7 @@ from intercap_core.evaluation.proximity import (
     visible_to_cloud,
 )
 from intercap_core.evaluation.scene_errors import displacement, rig_centre
+from intercap_core.flags import OF_OBJECT, PARTS, Flags
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import rigid
@@ -284,6 +285,10 @@ def test_extrinsics_displacement_of_a_shift_and_a_turn() -> None:
 
 def test_flags_join_reasons_and_runs() -> None:
     first, second = np.array([1, 1, 0, 0, 1], bool), np.array([0, 1, 1, 0, 0], bool)
-    reasons = flags.merge_reasons([(first, "a"), (second, "b")])
-    assert reasons == ["a", "a; b", "b", "", "a"]
+    found = Flags.of(5, [(first, "a", ["hands"]), (second, "b", OF_OBJECT), (first, "a", ["body"])])
+    assert found.reasons == ["a", "a; b", "b", "", "a"]
+    assert found.texts()[1:4] == ["body, hands, object, contact: a; b", "object, contact: b", ""]
+    assert found.summary() == "flagged: body 3, hands 3, object 2, contact 2 of 5 frames"
+    both = found | Flags.of(5, [(~first, "c", PARTS)])
+    assert both.reasons == ["a", "a; b", "b; c", "c", "a"] and both.flagged[2:4].all()
     assert flags.ranges(["a", "a", "", "b", "a", "a"]) == [(0, 1, "a"), (3, 3, "b"), (4, 5, "a")]

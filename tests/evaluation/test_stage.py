@@ -9,6 +9,7 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
+from intercap_core.flags import PARTS
 from intercap_core.schemas import METRIC_REGIONS, METRICS
 from tests.helpers import fitted_capture as fitted
 
@@ -106,9 +107,13 @@ def test_the_floor_of_cloud_distances_is_below_the_fit(measured: dict[str, np.nd
 
 def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
     assert measured["flag_reason"].tolist() == [
-        "object lost", "", "", "", "person seen in fewer than two views, without depth",
+        fitted.LOST, "", "", "", "person seen in fewer than two views, without depth",
     ]  # fmt: skip
-    assert measured["flagged"].tolist() == [True, False, False, False, True]
+    parts = [PARTS[p] for p in np.flatnonzero(measured["flagged"][0])]
+    assert parts == ["object", "contact"]  # the body of this frame is measured
+    parts = [PARTS[p] for p in np.flatnonzero(measured["flagged"][4])]
+    assert parts == ["body", "hands", "contact"]
+    assert not measured["flagged"][1:4].any()
 
 
 def test_without_truth_all_other_values_are_the_same(

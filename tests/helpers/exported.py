@@ -15,6 +15,7 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.config import ExportSettings
+from intercap_core.flags import Flags
 from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export.about import About, ExportBody, Verdict
 from intercap_core.output.export.motion import Motion
@@ -57,7 +58,7 @@ def plain_about(motion: Motion) -> About:
     """Return facts without flags, contact and verdict."""
     total = len(motion)
     verdict = Verdict((), np.zeros((0, total)), ())
-    return About(NAME, ExportBody.of(motion.model, "neutral"), [""] * total, None, verdict)
+    return About(NAME, ExportBody.of(motion.model, "neutral"), Flags.of(total, []), None, verdict)
 
 
 def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:

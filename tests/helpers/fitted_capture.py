@@ -32,6 +32,7 @@ from intercap_core.config import (
     ObjectTrackSettings,
 )
 from intercap_core.entries import ObjectEntry, SubjectEntry
+from intercap_core.flags import OF_OBJECT, PARTS, Flags
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
@@ -56,6 +57,7 @@ from tests.helpers.synthetic_people import write_detections
 
 FPS = 15.0
 BODY_OFFSET_M = 0.010  # the fitted body is this much below the true one
+LOST = "object lost, filled in"  # reason of the flag of the first frame
 OBJECT_OFFSET_M = 0.004  # the tracked ball is below the true one; half of it after joint
 SUBJECT = SubjectEntry(subject="p01", gender="neutral")
 BODY_MODELS = BodyModels()
@@ -208,6 +210,9 @@ def take_object_away(capture: Capture) -> Capture:
     for stage in ("object_track", "joint", "truth"):
         with capture.edit(stage) as file:
             file.attrs["object"] = ""
+    with capture.edit("joint") as file:
+        file["flagged"][...] = False
+        file["flag_reason"][...] = b""
     with capture.edit("truth") as file:
         file["region_contact"][...] = False
         for key in (
@@ -227,6 +232,8 @@ def lose_object(capture: Capture, doubts: str = "") -> None:
     with capture.edit("joint") as file:
         for key in ("rotation", "translation", "contact_probability"):
             file[key][...] = np.nan
+        file["flagged"][...] = np.isin(PARTS, OF_OBJECT)
+        file["flag_reason"][...] = LOST.encode()
 
 
 def write_project(folder: Path, capture: Capture, name: str) -> Path:
@@ -398,6 +405,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
             "master_from_colour": rig.master_from_colour, "energy_names": ["object", "body"],
             "energy_before": [2.0, 1.0], "energy_after": [1.0, 0.5],
         })  # fmt: skip
+        Flags.of(total, [(np.arange(total) == 0, LOST, OF_OBJECT)]).write(writer)
         fill(writer, JOINT, T=total, C=count)
 
 

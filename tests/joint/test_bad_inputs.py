@@ -21,6 +21,7 @@ from intercap_core.body.lemo import MotionEncoder
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.flags import PARTS
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT
 from intercap_core.sequence_inputs import FitSettings
@@ -143,7 +144,7 @@ def test_damage_is_logged_and_flagged_and_fit_stays_near(
         result = ball.run()
     reasons = result["flag_reason"]
     assert tuple(t for t in EVERY if reasons[t] and reason in reasons[t]) == flagged, reasons
-    np.testing.assert_array_equal(result["flagged"], reasons != "")
+    np.testing.assert_array_equal(result["flagged"].any(axis=1), reasons != "")
     assert message in caplog.text
     assert bool(message) == any(r.levelno >= logging.WARNING for r in caplog.records)
     for key in ("joints", "rotation", "translation", "contact_probability"):
@@ -179,10 +180,10 @@ def test_last_frame_without_a_body_fit(captures, tmp_path, frames: int):
     ball.put("body_fit", failed=failed, bridged=failed)
     result = ball.run()
     assert np.isfinite(result["joints"]).all()
-    assert result["flagged"].tolist() == failed.tolist()
+    assert result["flagged"].any(axis=1).tolist() == failed.tolist()
 
 
-def test_undetermined_hand_is_marked_but_not_flagged(captures, tmp_path):
+def test_undetermined_hand_flags_the_hands_alone(captures, tmp_path):
     ball = HeldBall.copied(captures(3), tmp_path)
     ball.put("scene", ground_found=False)
     with h5py.File(ball.paths["body_fit"], "r+") as file:
@@ -190,7 +191,8 @@ def test_undetermined_hand_is_marked_but_not_flagged(captures, tmp_path):
         file["bridged"][2] = True
     result = ball.run()
     assert result["hand_undetermined"].tolist() == [[False, True], [False, True], [True, True]]
-    assert not result["flagged"][1]
+    flagged = [[PARTS[p] for p in np.flatnonzero(row)] for row in result["flagged"]]
+    assert flagged == [["hands"], ["hands"], ["body", "hands", "contact"]]
 
 
 def test_annotated_contact_needs_contact_vertices(ball, tmp_path):

@@ -16,6 +16,7 @@ from intercap_core.commands.closing import print_remarks, remarks
 from intercap_core.commands.inspect import print_summary
 from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
+from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
 from intercap_core.pipeline.step import run_step
@@ -31,9 +32,10 @@ SAYS = {
     "person": "the subject in 4 of 5 frames, by 3.0 views",
     "object_track": "tracked in 4 of 5 frames, 0 of them ambiguous",
     "body_fit": "fitted in 5 of 5 frames",
-    "joint": "3 steps, 0 refused, converged (last step 0.2 mm); contact in 0 of 5 frames, 2 not",
+    "joint": "3 steps, 0 refused, converged (last step 0.2 mm); contact in 0 of 5 frames; "
+    "flagged: object 3, contact 3 of 5 frames",
     "metrics": "estimated errors: body ",
-    "summary": "5 frames, 4 flagged, ",
+    "summary": "flagged: body 1, hands 1, object 3, contact 4 of 5 frames, ",
 }
 
 
@@ -50,8 +52,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     folder = tmp_path_factory.mktemp("project")
     capture = fitted.make_capture(folder, name="s01")
     with h5py.File(capture.paths["joint"], "r+") as file:
-        file["flagged"][1:3] = True
-        _say(file, "flag_reason", ["", *["object lost, filled in"] * 2, "", ""])
+        file["flagged"][1:3] = np.isin(PARTS, OF_OBJECT)
+        file["flag_reason"][1:3] = fitted.LOST.encode()
     with h5py.File(capture.paths["scene"], "r+") as file:
         _say(file, "note", ["", "its pose is as given", ""])
     path = fitted.write_project(folder, capture, "s01")
@@ -108,9 +110,9 @@ def test_a_joint_fit_without_a_step_is_noted(project: Project, tmp_path: Path) -
 
 
 def test_flagged_frames_with_their_reasons(project: Project) -> None:
-    flagged, frames, reasons = outcome.flagged_frames(project.artefact("s01", "metrics"))
-    assert (flagged, frames) == (4, 5)  # one has no person, one no object by the track
-    assert reasons[0] == ("object lost, filled in", 2)
+    flags, reasons = outcome.flagged_frames(project.artefact("s01", "metrics"))
+    assert flags.summary() == "flagged: body 1, hands 1, object 3, contact 4 of 5 frames"
+    assert reasons[0] == (fitted.LOST, 3)
 
 
 def _printed(project: Project, width: int = 80) -> list[str]:
@@ -121,8 +123,8 @@ def _printed(project: Project, width: int = 80) -> list[str]:
 
 def test_a_run_ends_with_remarks_worst_first(project: Project, logs: None) -> None:
     (found,) = remarks(project)
-    assert found.share == pytest.approx(4 / 5)
-    assert found.texts[0].startswith("4 of 5 frames flagged: object lost, filled in (2)")
+    assert found.share == pytest.approx((1 + 1 + 3 + 4) / 20)
+    assert "3, contact 4 of 5 frames: object lost, filled in (3)" in found.texts[0]
     assert "scene: camera k2: its pose is as given" in found.texts
     printed = "\n".join(_printed(project, width=200))
     assert "1 of 1 sequences have remarks, worst first" in printed
@@ -194,7 +196,7 @@ def test_texts_are_printed_as_they_are(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     print_summary(Path(project.artefact("s01", "joint")))
-    assert "  1 to 2: object lost, filled in" in capsys.readouterr().out
+    assert "  0 to 2: object lost, filled in" in capsys.readouterr().out
     print_summary(Path(project.artefact("s01", "scene")))
     assert "  k2: its pose is as given" in capsys.readouterr().out
 

@@ -224,7 +224,7 @@ def test_results_are_points_and_pictures_of_the_body(
         moment = found.at(2)
         assert moment.object_.shape == (0, 3) and found.objects().shape == (6, 0, 3)
         assert moment.body.shape[1] == 3 and abs(moment.body[:, 2].min()) < 0.05
-        assert found.trusted.any()
+        assert found.trusted["body"].any() and "object" not in found.trusted
     assert draw_closeups(project.path, []) == ([], [NAME])
     for stage in SEQUENCE_STAGES:
         print_summary(project.artefact(NAME, stage), verify=True)

@@ -217,7 +217,7 @@ def _of_a_person_alone(sequence: FieldSequence) -> bool:
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
     """Print one row per recording: true and stated errors, bone lengths, height."""
     console = standard_console()
-    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
+    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "body flagged %",
              "bones %", "height mm", "subject %", "up deg", "stated")  # fmt: skip
     table = ListTable("recording", *heads, title="the field, after metrics")
     for found in evaluations:
@@ -231,7 +231,7 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
             table.add_row(
                 f"{found.dataset}: {e.metrics.name}",
                 *cells,
-                number(100 * float(e.metrics.values["flagged"].mean()), 0),
+                number(100 * e.metrics.flags.shares()["body"], 0),
                 number(100 * float(np.abs(e.bones).mean()), 1),
                 number(1e3 * e.height_m, 0),
                 number(100 * e.subject_right, 0),

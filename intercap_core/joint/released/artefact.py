@@ -14,6 +14,7 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
+from intercap_core.flags import PARTS, Flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.released import (
     BEHAVE_OBJECT,
@@ -99,9 +100,7 @@ def import_joint(
     with torch.no_grad():
         posed = model.forward(params, vertex_ids=model.keypoint_map.vertex_ids)
         keypoints = model.keypoints(posed).double().numpy()
-    reasons = list(released.reasons) or [
-        "" if k else "no result in the imported file" for k in known
-    ]
+    flags = released.flags or Flags.of(total, [(~known, "no result in the imported file", PARTS)])
     variation = _shape_variation(model, released.betas[known], shape)
     if variation > 0.001:
         log.warning(
@@ -148,8 +147,7 @@ def import_joint(
         writer.put("energy_before", np.zeros(0))
         writer.put("energy_after", np.zeros(0))
         writer.put("hand_undetermined", np.zeros((total, 2), bool))
-        writer.put("flagged", np.array([bool(reason) for reason in reasons]))
-        writer.put("flag_reason", reasons)
+        flags.write(writer)
         if released.surface_distance is not None:
             writer.put("surface_distance", released.surface_distance)
 

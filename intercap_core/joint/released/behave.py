@@ -19,6 +19,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.flags import OF_BODY, PARTS, Cause, Flags
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.released import (
     BEHAVE_OBJECT,
@@ -82,7 +83,10 @@ def read_results(folder: Path, recording: Recording) -> Results:
         reasons[known & ~posed] = "no pose of the object in the imported files"
         known &= posed
     far = (distance[:, 0] > FLAGGED_MEAN_M) | (distance[:, 1] > FLAGGED_P95_M)
-    reasons[known] = np.where(far[known], "the body is far from the mesh that it was fitted to", "")
+    lacking: list[Cause] = [
+        (~known & (reasons == reason), reason, PARTS) for reason in dict.fromkeys(reasons)
+    ]
+    far_off = (known & far, "the body is far from the mesh that it was fitted to", OF_BODY)
     mean, p95 = 1e3 * np.mean(fitted.distance, axis=0)
     log.info(
         "sequence %s: the body was fitted to %d meshes in %s; distance %.1f mm (mean), %.1f mm "
@@ -103,7 +107,7 @@ def read_results(folder: Path, recording: Recording) -> Results:
         translation=translation,
         source=f"BEHAVE, {folder.name}; body fitted to its meshes, {mean:.1f} mm from them in the "
         f"mean (95th percentile {p95:.1f} mm)",
-        reasons=list(reasons),
+        flags=Flags.of(total, [*lacking, far_off]),
         surface_distance=distance,
     )
 

@@ -24,6 +24,7 @@ from intercap_core.evaluation.verdict.figures import (
     held_out_cameras,
     stated_errors,
 )
+from intercap_core.flags import PARTS, Flags
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.motion import Coordinates, Motion, rounded_lists
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK
@@ -258,8 +259,7 @@ class About:
 
     sequence: str
     body: ExportBody
-    flags: Sequence[str]
-    """(T,) reason why each frame is flagged, "" if it is trusted."""
+    flags: Flags
     contact: StatedContact | None
     """Contact by body region; None without an object."""
     verdict: Verdict
@@ -276,7 +276,10 @@ class About:
             "sequence": self.sequence,
             "body": self.body.to_json(),
             **coordinates.to_json(),
-            "flagged_frames": {str(t): reason for t, reason in enumerate(self.flags) if reason},
+            "flagged_frames": {
+                str(t): self.flags.at(t)
+                for t in np.flatnonzero(self.flags.flagged.any(axis=1)).tolist()
+            },
             **self.verdict.to_json(),
         }
         if self.made_by:
@@ -304,8 +307,9 @@ class About:
     def per_frame_arrays(self) -> dict[str, np.ndarray]:
         """Serialize flags, contact, deviations and verdict of every frame for npz files."""
         arrays = {
-            "flagged": np.array([bool(reason) for reason in self.flags]),
-            "flag_reason": np.array(list(self.flags)),
+            "flag_part": np.array(PARTS),
+            "flagged": self.flags.flagged,
+            "flag_reason": np.array(list(self.flags.reasons)),
             **self.verdict.to_arrays(),
         }
         if self.contact is not None:

@@ -67,7 +67,7 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
             _dump(scene / "scene_gt_info.json", info)
         frame_of = scenes.frames_of(number)
         frames = {
-            str(image): {"frame": frame_of[image], "flagged": about.flags[frame_of[image]]}
+            str(image): {"frame": frame_of[image], **about.flags.at(frame_of[image])}
             for image in poses
         }
         _dump(scene / "scene_about.json", {"camera": camera.name, "images": frames})

@@ -50,7 +50,7 @@ def write(path: Path, scenes: Scenes, about: About) -> None:
                 "camera": camera.name,
                 "frame": drawn.t,
                 "time_s": float(scenes.times[drawn.t] + scenes.time_offset[number]),
-                "flagged": about.flags[drawn.t],
+                **about.flags.at(drawn.t),
             }
             images.append(image)
             for entry in _annotations(drawn, camera, keypoints[drawn.t]):

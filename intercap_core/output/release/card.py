@@ -26,6 +26,7 @@ from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
+from intercap_core.flags import PARTS
 from intercap_core.versions import versions
 
 Facts = dict[str, Any]
@@ -179,7 +180,8 @@ def _splits(measured: Sequence[SequenceMetrics], settings: CardSettings) -> tupl
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the card's figures of each group; None if unknown."""
-    columns = ["sequences", "frames", "minutes", "contact_percent", "flagged_percent"]
+    columns = ["sequences", "frames", "minutes", "contact_percent"]
+    columns += [f"flagged.{part}_percent" for part in PARTS]
     rows = []
     for row in table.to_dict("records"):
         group = {str(table.columns[0]): row[table.columns[0]]}
@@ -213,16 +215,20 @@ def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
 
 
 def _flagged(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
-    """Count flagged frames, and the frames with each reason."""
+    """Count the flagged frames of each part, and the frames with each reason."""
     counted: Counter[str] = Counter()
     for s in summaries:
-        for reasons in s.metrics.values["flag_reason"]:
+        for reasons in s.metrics.flags.reasons:
             kinds = {_NUMBER.sub("…", part.strip()) for part in str(reasons).split(";")}
             counted.update(kinds - {""})
-    flags = np.concatenate([s.metrics.values["flagged"] for s in summaries])
+    flags = figures.pooled_flags([s.metrics for s in summaries])
     return {
-        "frames": int(flags.sum()),
-        "percent": round(100 * float(flags.mean()), 2),
+        "parts": [
+            {"part": part, "frames": int(count), "percent": round(100 * share, 2)}
+            for (part, share), count in zip(
+                flags.shares().items(), flags.flagged.sum(axis=0), strict=True
+            )
+        ],
         "reasons": [
             {"reason": why, "frames": count} for why, count in counted.most_common(_MAX_REASONS)
         ],

@@ -11,6 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from intercap_core.flags import Flags
 from intercap_core.output.site.drawing import EncodedImage
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -56,6 +57,14 @@ def tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) 
     known = value is not None and np.isfinite(value)
     text = f"{value:.{digits}f}{'' if unit == '°' else ' '}{unit}".rstrip() if known else "–"
     return {"name": name, "value": text, "note": note}
+
+
+def flag_tile(flags: Flags) -> dict[str, str]:
+    """Return the share of frames with a flag of the body, and in words those of other parts."""
+    shares = {part: 100 * share for part, share in flags.shares().items()}
+    body = shares.pop("body")
+    others = ", ".join(f"{part} {share:.0f} %" for part, share in shares.items())
+    return tile("body flagged", body, "%", others)
 
 
 def span(first: int, last: int) -> str:

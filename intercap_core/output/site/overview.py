@@ -13,9 +13,10 @@ from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated
+from intercap_core.flags import PARTS
 from intercap_core.output.site import measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, embedded, render, span, tile
+from intercap_core.output.site.embed import css, embedded, flag_tile, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
 from intercap_core.output.site.preview import PREVIEW
 from intercap_core.versions import versions
@@ -101,7 +102,7 @@ def page(content: DatasetContent) -> str:
             "reason": reason,
         }
         for s in measured
-        for first, last, reason in flags.ranges(list(s.values["flag_reason"]))
+        for first, last, reason in flags.ranges(s.flags.texts())
     ]
     context = {
         "dataset": content.dataset,
@@ -127,7 +128,7 @@ def page(content: DatasetContent) -> str:
         "cameras": measures.cameras(measured, {s.name: s.residuals for s in content.sequences}),
         "flagged_runs": runs[:_MAX_RUNS],
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
-        "flagged_frames": sum(int(s.values["flagged"].sum()) for s in measured),
+        "flagged_text": figures.pooled_flags(measured).summary(),
         "versions": versions(),
         "changed": content.changed,
         "made_by": _made_by(content.sequences),
@@ -158,7 +159,6 @@ def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> s
 def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     depth = figures.penetration_figures(measured)
     cloud = figures.cloud_figures(measured)
-    flagged = np.concatenate([s.values["flagged"] for s in measured])
     tiles = []
     if any(s.has_truth for s in measured):
         joint = figures.truth_figures(measured, "joint")
@@ -186,8 +186,7 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if handling:
         tiles.append(tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
-    share, count = 100 * float(flagged.mean()), int(flagged.sum())
-    return [*tiles, tile("flagged", share, "%", f"{count:,} frames not trusted")]
+    return [*tiles, flag_tile(figures.pooled_flags(measured))]
 
 
 def _worst_object(measured: Sequence[SequenceMetrics], key: str, unit: str) -> str:
@@ -210,7 +209,10 @@ def _rows(content: DatasetContent) -> list[dict[Hashable, Any]]:
     return [
         record
         | {
-            "flagged": 100 * record["flagged_frames"] / record["frames"],
+            **{
+                f"flagged_{part}": 100 * record[f"flagged.{part}_frames"] / record["frames"]
+                for part in PARTS
+            },
             "contact": 100 * record["contact_frames"] / record["frames"],
             "page": content.page_of[record["sequence"]],
             "preview": content.page_of[record["sequence"]].replace("index.html", PREVIEW),

@@ -13,9 +13,10 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
+from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, embedded, render, span, tile
+from intercap_core.output.site.embed import css, embedded, flag_tile, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.output.site.preview import Preview
 from intercap_core.output.viewer import page as viewer
@@ -58,11 +59,12 @@ class SequenceContent:
 def page(content: SequenceContent) -> str:
     """Return the HTML of the page."""
     s = content.metrics
+    flagged = s.flags.texts()
     cameras: dict[str, list[dict[str, Any]]] = {}
     for overlay in content.overlays:
         caption = f"camera {overlay.camera}, frame {overlay.frame}"
-        if s.values["flagged"][overlay.frame]:
-            caption += f" (flagged: {s.values['flag_reason'][overlay.frame]})"
+        if why := flagged[overlay.frame]:
+            caption += f" (flagged: {why})"
         cameras.setdefault(overlay.camera, []).append(embedded(overlay.image, caption))
     context = {
         "name": s.name,
@@ -79,9 +81,9 @@ def page(content: SequenceContent) -> str:
         "truth": measures.truth([s]),
         "flagged_runs": [
             {"frames": span(first, last), "reason": reason}
-            for first, last, reason in flags.ranges(list(s.values["flag_reason"]))
+            for first, last, reason in flags.ranges(flagged)
         ],
-        "flagged_frames": int(s.values["flagged"].sum()),
+        "flagged_text": s.flags.summary(),
         "energies": _energies(content.energies),
         "joint": content.joint,
         "cameras": list(cameras.values()),
@@ -138,21 +140,20 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
         tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
         share = 100 * float(s.values["contact_frame"].mean())
         tiles.append(tile("in contact", share, "%", "of the frames", 0))
-    flagged = s.values["flagged"]
-    share = 100 * float(flagged.mean())
-    return [*tiles, tile("flagged", share, "%", f"{int(flagged.sum())} frames not trusted")]
+    return [*tiles, flag_tile(s.flags)]
 
 
 def _rows(
     s: SequenceMetrics, annotated: Sequence[ContactInterval] | None
 ) -> list[charts.TimelineRow]:
     """Return rows for flags, frames in contact, and contact of each region by source."""
-    reasons = flags.ranges(list(s.values["flag_reason"]))
-    rows = [
-        charts.TimelineRow(
-            "flagged", [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in reasons]
-        )
-    ]
+    reasons = s.flags.reasons
+    rows = []
+    for part, mask in zip(PARTS, s.flags.flagged.T, strict=True):
+        found = flags.ranges([why if on else "" for why, on in zip(reasons, mask, strict=True)])
+        marks = [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in found]
+        if s.has_object or part not in OF_OBJECT:
+            rows.append(charts.TimelineRow(f"flagged, {part}", marks))
     annotated_runs: dict[str, list[tuple[int, int, str, str]]] = {}
     for interval in annotated or ():
         last = min(interval.end, len(s)) - 1

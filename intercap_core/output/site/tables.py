@@ -19,6 +19,7 @@ from intercap_core.evaluation.verdict.figures import (
     mean_stated,
     stated_errors,
 )
+from intercap_core.flags import PARTS
 from intercap_core.stage_list import ESTIMATES
 
 _MILLIMETRES = {
@@ -59,7 +60,10 @@ def sequence_table(
             "frames": len(s),
             "fps": s.fps,
             "made_by": s.made_by,
-            "flagged_frames": int(s.values["flagged"].sum()),
+            **{
+                f"flagged.{part}_frames": int(count)
+                for part, count in zip(PARTS, s.flags.flagged.sum(axis=0), strict=True)
+            },
             "contact_frames": int(s.values["contact_frame"].sum()) if s.has_object else np.nan,
         }
         row |= _figures([s])
@@ -114,17 +118,16 @@ def group_table(
     rows = []
     for group in sorted({group_of[s.name] for s in sequences} - {""}):
         members = [s for s in sequences if group_of[s.name] == group]
-        flagged, touching = (
-            figures.pooled(members, "flagged"),
+        flags, touching = (
+            figures.pooled_flags(members),
             figures.pooled(members, "contact_frame"),
         )
-        assert flagged is not None
         row: dict[str, object] = {
             by: group,
             "sequences": len(members),
-            "frames": len(flagged),
+            "frames": len(flags.reasons),
             "minutes": sum(len(s) / s.fps for s in members) / 60,
-            "flagged_percent": 100 * float(flagged.mean()),
+            **{f"flagged.{part}_percent": 100 * s for part, s in flags.shares().items()},
             "contact_percent": np.nan if touching is None else 100 * float(touching.mean()),
             **_figures(members),
         }
@@ -201,7 +204,7 @@ def worst_first(table: pd.DataFrame) -> pd.Series:
     """Return the rank of each sequence, 1 = worst, by its mean rank in several measures.
 
     The measures are:
-    - share of flagged frames
+    - share of flagged frames, mean over the parts
     - distances of the visible body and object to the cloud
     - 98th percentile of penetration
     - stated error of each part; the worst rank if none is stated
@@ -210,7 +213,8 @@ def worst_first(table: pd.DataFrame) -> pd.Series:
     """
     measures = pd.DataFrame(
         {
-            "flagged": table["flagged_frames"] / table["frames"],
+            "flagged": table[[f"flagged.{part}_frames" for part in PARTS]].sum(axis=1)
+            / table["frames"],
             **{name: table[column] for column, name in _RANKED.items()},
             **{
                 part: table[f"verdict.{part}_mm"].fillna(np.inf)
@@ -235,8 +239,8 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
             "sequence": np.repeat(s.name, total),
             "frame": np.arange(total),
             "time_s": np.arange(total) / s.fps,
-            "flagged": s.values["flagged"],
-            "flag_reason": s.values["flag_reason"].astype(str),
+            **dict(zip((f"flagged.{part}" for part in PARTS), s.flags.flagged.T, strict=True)),
+            "flag_reason": s.flags.reasons,
         }
         if s.has_object:
             names = s.values["region_names"]

@@ -21,6 +21,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.segmented import SegmentedClouds, read_clouds
 from intercap_core.evaluation.truth import Truth
+from intercap_core.flags import Flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
@@ -79,7 +80,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
                 model, read_parameters(joint), joint["rotation"], joint["translation"]
             )
             rig, bias = rig.moved(joint["master_from_colour"]), joint["depth_bias"]
-            flags = joint.text("flag_reason")
+            flags = Flags.read(joint).texts()
             imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
     bodies["sequential"] = _sequential(paths.body_fit, existing, body_models, gender)
@@ -153,7 +154,7 @@ def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> 
 
 
 def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
-    """Add touching vertices as bits (T, ceil(V / 8)); return the reasons of flags."""
+    """Add touching vertices as bits (T, ceil(V / 8)); return the flags in words."""
     with artefacts.read(metrics, METRICS) as measured:
         if "body_contact_distance" in measured:
             touching = vertex_contact(measured["body_contact_distance"])
@@ -164,7 +165,7 @@ def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequenc
                     f"{num_vertices}; re-run stage 'metrics'"
                 )
             content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
-        return measured.text("flag_reason")
+        return Flags.read(measured).texts()
 
 
 def _simplified(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

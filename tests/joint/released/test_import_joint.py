@@ -120,7 +120,7 @@ def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):
         made = _import(capture, tmp_path / "theirs.pkl", tmp_path)
     assert "varies by frame" in caplog.text
     with artefacts.read(made.paths["joint"], JOINT) as theirs:
-        assert theirs["flagged"].tolist() == [False, True, False, False, False]
+        assert theirs["flagged"].tolist() == [[t == 1] * 4 for t in range(5)]
         assert theirs.text("flag_reason")[1] == "no result in the imported file"
         assert np.isfinite(theirs["joints"]).all()
         ours = _left_hand(capture)

@@ -14,6 +14,7 @@ import trimesh
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
+from intercap_core.flags import Flags
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -98,6 +99,7 @@ def test_contact_is_in_every_format(
         assert np.shape(entries["contact_annotated"]) == probability.shape
         if not _is_json(entries):
             assert list(entries["flag_reason"]) == reasons, name
+            assert list(entries["flag_part"][entries["flagged"][0]]) == ["object", "contact"]
 
 
 def test_deviations_and_stated_errors_are_in_every_format(
@@ -186,14 +188,15 @@ def test_the_verdict_of_each_camera_is_exported(capture: fitted.Capture, everyth
 
 def test_bop_images_name_their_frame(capture: fitted.Capture, everything: Path) -> None:
     with artefacts.read(capture.paths["metrics"], METRICS) as measured:
-        reasons = measured.text("flag_reason")
+        flags = Flags.read(measured)
+    assert flags.at(0) == {"flagged": ["object", "contact"], "flag_reason": fitted.LOST}
     for number, camera in enumerate(capture.rig):
         scene = everything / "bop" / "scenes" / f"{number:06d}"
         content = json.loads((scene / "scene_about.json").read_text())
         assert content["camera"] == camera.name
         assert content["images"].keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
         for image, exported_values in content["images"].items():
-            assert exported_values == {"frame": int(image), "flagged": reasons[int(image)]}
+            assert exported_values == {"frame": int(image), **flags.at(int(image))}
 
 
 def test_imported_results_have_no_deviations(capture: fitted.Capture, tmp_path: Path) -> None:

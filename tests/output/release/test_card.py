@@ -55,7 +55,9 @@ def test_json_says_what_the_tables_say(folder: Path) -> None:
     assert card["counts"]["sequences"] == len(rows) == 3
     assert card["counts"]["frames"] == sum(int(row["frames"]) for row in rows) == 12
     assert card["counts"]["objects"] == 2 and card["counts"]["subjects"] == 1
-    assert card["flagged"]["frames"] == sum(int(row["flagged_frames"]) for row in rows) >= 6
+    for entry in card["flagged"]["parts"]:
+        of_rows = sum(int(row[f"flagged.{entry['part']}_frames"]) for row in rows)
+        assert entry["frames"] == of_rows >= 6, entry
     # numbers within a reason make no new one
     reasons = {entry["reason"]: entry["frames"] for entry in card["flagged"]["reasons"]}
     assert reasons["lost … frames | ago"] == 6 and reasons["unsure"] == 3
@@ -122,5 +124,7 @@ def test_a_croissant_loader_reads_the_tables(folder: Path) -> None:
     assert [row["splits/sequence"] for row in rows] == [b"s01_o03", b"s01_o09", b"s01_o09_b"]
     assert [row["splits/frames"] for row in rows] == [4, 4, 4]
     frames = list(dataset.records(record_set="frames"))
-    flagged = json.loads((folder / "card.json").read_text())["flagged"]["frames"]
-    assert len(frames) == 12 and sum(bool(row["frames/flagged"]) for row in frames) == flagged
+    assert len(frames) == 12
+    for entry in json.loads((folder / "card.json").read_text())["flagged"]["parts"]:
+        flagged = [bool(row[f"frames/flagged.{entry['part']}"]) for row in frames]
+        assert sum(flagged) == entry["frames"]

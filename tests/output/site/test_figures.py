@@ -12,6 +12,7 @@ import pytest
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact import SWEEP_M
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.output.site import tables
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -25,7 +26,7 @@ def sequence(name: str = "a", total: int = 4, **values: object) -> SequenceMetri
     )  # fmt: skip
     known = {key: np.full(total, 0.010, np.float32) for key in lengths}
     known |= {
-        "flagged": np.zeros(total, bool),
+        "flagged": np.zeros((total, len(PARTS)), bool),
         "flag_reason": np.array([""] * total, object),
         "contact_frame": np.ones(total, bool),
         "region_names": np.array(CONTACT_REGIONS, object),
@@ -68,7 +69,7 @@ def _tracked(**values: object) -> SequenceMetrics:
         "truth/object_moving": np.zeros(total, bool),
         "truth/object_views": [6, 2, 1, 6],
         "truth/joint/acceleration_object": [np.nan, 0.001, 0.003, np.nan],
-        "flagged": [False, False, True, False],
+        "flagged": np.outer([False, False, True, False], np.isin(PARTS, OF_OBJECT)),
     }
     return sequence(**(known | values))
 
@@ -115,13 +116,16 @@ def test_contact_and_hands_in_grasp() -> None:
 
 def test_flags_are_judged_on_truly_bad_frames() -> None:
     s = _tracked(**{"truth/joint/body_pve": np.array([0.01, 0.05, 0.01, 0.01])})
-    found = figures.flag_figures([s])  # bad: 1, 2 and 3, of which 2 is flagged
+    # bad: the body of frame 1, the object of frames 2 and 3, of which that of 2 is flagged
+    found = figures.flag_figures([s])
     assert found == pytest.approx({"bad_frames": 0.75, "flag_recall": 1 / 3, "flag_precision": 1})
+    s.values["flagged"][1, PARTS.index("object")] = True  # says nothing about the body
+    assert figures.flag_figures([s])["flag_recall"] == pytest.approx(1 / 3)
     assert figures.flag_figures([sequence()]) == {}
 
 
 def test_a_lost_object_is_noticed_by_its_own_stage_alone() -> None:
-    s = _tracked(flagged=[True] * 4, **{"truth/joint/object_flagged": np.zeros(4, bool)})
+    s = _tracked(flagged=np.ones((4, 4), bool), **{"truth/joint/object_flagged": np.zeros(4, bool)})
     assert figures.truth_figures([s], "joint")["lost_unnoticed_share"] == 0.5
 
 
@@ -166,7 +170,7 @@ def test_late_and_early_starts_of_motion_do_not_cancel() -> None:
             "truth/object_centre": started(20),
             "truth/object_moving": moving,
             "truth/object_views": np.full(total, 6),
-            "flagged": np.zeros(total, bool),
+            "flagged": np.zeros((total, len(PARTS)), bool),
         }
         return SequenceMetrics("s", "p", "cup", fps, True, values)
 
@@ -202,7 +206,7 @@ def test_summary_has_exactly_the_agreed_keys() -> None:
 
 def test_ranks_put_the_worst_sequence_first() -> None:
     good = sequence("good", object_visible_to_cloud=[0.005] * 4)
-    bad = sequence("bad", flagged=np.ones(4, bool), penetration_mean=[0.03] * 4)
+    bad = sequence("bad", flagged=np.ones((4, 4), bool), penetration_mean=[0.03] * 4)
     untouched = sequence("untouched", contact_frame=np.zeros(4, bool))
     table = tables.sequence_table([good, bad, untouched], {"bad": (0.01, 0.004)})
     ranks = dict(zip(table["sequence"], table["rank"], strict=True))
@@ -210,7 +214,7 @@ def test_ranks_put_the_worst_sequence_first() -> None:
     row = table.set_index("sequence").loc["bad"]
     assert row["extrinsics_residual_before_mm"] == pytest.approx(10)
     assert row["penetration.mean_mm"] == pytest.approx(30, rel=1e-5)
-    assert row["flagged_frames"] == 4
+    assert row["flagged.object_frames"] == 4
 
 
 def test_frame_table_has_a_row_a_frame(tmp_path: Path) -> None:
