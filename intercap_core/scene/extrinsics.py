@@ -15,7 +15,7 @@ from intercap_core.scene.constraints import (
     FloorConstraint,
     body_views,
 )
-from intercap_core.scene.keypoint_timing import TIMING_INFLATION
+from intercap_core.scene.keypoint_timing import undetermined
 from intercap_core.scene.moments import Moments
 from intercap_core.scene.registration import (
     MOVING,
@@ -113,7 +113,7 @@ def refine(
     given = RigEstimate.start(rig, starts.offset)
     views = body_views(moments.subject, times)
     body = BodyConstraint(views, rig) if views.suffice else None
-    known = timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
+    known = timing.information, timing.vector
     overlapping = [pair for k in (STATIC, MOVING) for pair in registration.residuals(given, k)]
     linked = _linked(overlapping, master)
     constraints: list[Constraint] = [body] if body else []
@@ -151,9 +151,8 @@ def refine(
                 covariance = freed.covariance
     pairs = _pair_table(registration, unmoved.estimate, result.estimate)
     sigma = np.sqrt(np.diagonal(result.covariance[:, OFFSET, :, OFFSET]))
-    # An offset whose standard deviation exceeds 8 ms (tuned) is unknown: the given value is kept.
     # Offsets of cameras with a stated start are always known.
-    unknown = (sigma > 0.008) & np.isnan(starts.sigma)
+    unknown = undetermined(sigma, starts.offset_sigma) & np.isnan(starts.sigma)
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
     converged = result.last_step_m < 0.001

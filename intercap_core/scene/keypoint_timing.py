@@ -19,14 +19,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.formats.recordings.synchronise import (
+    frame_interval,
+    images_of_moments,
+    in_step_sigma,
+)
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
-# Factor that users of TimeOffsets apply to ``sigma``: errors of one person's keypoints are
-# correlated. Tuned on the studio.
-TIMING_INFLATION = 2.0
+# Factor of the variance, because the errors of one person's keypoints are correlated over all
+# groups of keypoints. Tuned on the studio.
+COMMON_ERRORS = 4.0
 MIN_TIMING_SETS = 8  # least number of sets for an estimate; tuned on the studio
 
 
@@ -134,7 +138,8 @@ def find_offsets(
         slip: (T, C) whole sets by which an image is older than its set.
         times: (T,) seconds.
         master: camera whose offset is 0.
-        start: (C,) seconds, approximate offsets; None = nearly 0.
+        start: (C,) seconds, approximate offsets; None = 0. They are no evidence: the prior is about
+            0.
     """
     shown = keypoints_by_moment(keypoints, slip)
     views = len(rig)
@@ -143,11 +148,11 @@ def find_offsets(
         return TimeOffsets(np.zeros(views), unknown, np.zeros((views, views)), np.zeros(views))
     motion = build_motion(shown, rig, times)
     start = np.zeros(views) if start is None else start
-    first = start + estimate_offsets(motion.at_offsets(start), master).offset
+    first = start + estimate_offsets(motion.at_offsets(start), master, -start).offset
     # Paths of views that are apart in time are wrong in proportion to the offsets, and so are the
     # first estimates: new paths from keypoints without the effect of the offsets.
     again = build_motion(motion.without_offsets(shown, first), rig, times)
-    change = estimate_offsets(again, master)
+    change = estimate_offsets(again, master, -first)
     return replace(
         change,
         offset=np.where(np.isfinite(change.sigma), first + change.offset, start),
@@ -155,79 +160,88 @@ def find_offsets(
     )
 
 
-def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
+def undetermined(sigma: np.ndarray, prior_sigma: np.ndarray) -> np.ndarray:
+    """Where data leave more than half of the prior's variance; both are standard deviations."""
+    return sigma**2 > prior_sigma**2 / 2
+
+
+def estimate_offsets(motion: KeypointMotion, master: int, expected: np.ndarray) -> TimeOffsets:
     """The time offsets that explain a motion's residuals best.
 
     Generalised least squares for 7C unknowns: C offsets, then 6 pose errors of each camera. The
     points are already eliminated by the motion's projector. ``information`` and ``vector`` of the
     result are the equations of the offsets with the poses eliminated.
+
+    Args:
+        motion: residuals of the keypoints.
+        master: camera whose offset is 0.
+        expected: (C,) mean of the prior, seconds; its deviation is :func:`.in_step_sigma`.
     """
     views = len(motion.rig)
     # derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors
     by_offset = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
     columns = np.concatenate([np.stack(by_offset), _pose_columns(motion)])
     matrices, vectors = _keypoint_equations(motion, columns)
-    # offsets are uncertain by 50 ms, given poses by a degree and 2 cm; tuned on the studio
+    prior_sigma = np.full(views, in_step_sigma(frame_interval(motion.times)))
+    # given poses are uncertain by a degree and 2 cm; tuned on the studio
     pose_sigma = np.repeat([np.radians(1.0), 0.02], 3)
-    prior = np.r_[np.full(views, 0.05**-2.0), np.tile(pose_sigma**-2.0, views)]
+    prior = np.r_[prior_sigma**-2.0, np.tile(pose_sigma**-2.0, views)]
     free = np.flatnonzero(np.arange(7 * views) != master)
-    matrix, vector = matrices.sum(0), vectors.sum(0)
-    covariance = np.linalg.inv((matrix + np.diag(prior))[np.ix_(free, free)])
-    solution = np.zeros(7 * views)
-    solution[free] = covariance @ vector[free]
     # places of the offsets, without the master's, among the free unknowns
     own = np.searchsorted(free, np.delete(np.arange(views), master))
-    inflation = _inflation(matrices, vectors, solution, covariance, free, own)
-    poses = (matrix + np.diag(prior))[views:, views:]
-    solved = np.linalg.solve(poses, matrix[views:, :views])
-    information = matrix[:views, :views] - matrix[:views, views:] @ solved
+    inflation = _inflation(matrices, vectors, prior, free, own)
+    matrix, vector = matrices.sum(0) / inflation, vectors.sum(0) / inflation
+    posterior = matrix + np.diag(prior)
+    covariance = np.linalg.inv(posterior[np.ix_(free, free)])
+    expectation = prior * np.r_[expected, np.zeros(6 * views)]
     offset, sigma = np.zeros(views), np.zeros(views)
-    offset[free[own]] = solution[free[own]]
-    random = inflation * np.diag(covariance)[own]
-    sigma[free[own]] = np.sqrt(random)
-    # less certain offsets than to 20 ms are unknown; tuned on the studio
-    unknown = sigma > 0.02
+    offset[free[own]] = (covariance @ (vector + expectation)[free])[own]
+    sigma[free[own]] = np.sqrt(np.diag(covariance)[own])
+    unknown = undetermined(sigma, prior_sigma)
     offset[unknown], sigma[unknown] = 0.0, np.nan
+    solved = np.linalg.solve(posterior[views:, views:], matrix[views:, :views])
+    information = matrix[:views, :views] - matrix[:views, views:] @ solved
     return TimeOffsets(
         offset,
         sigma,
-        (information + information.T) / 2 / inflation,
-        (vector[:views] - solved.T @ vector[views:]) / inflation,
+        (information + information.T) / 2,
+        vector[:views] - solved.T @ vector[views:],
     )
 
 
 def _inflation(
     matrices: np.ndarray,
     vectors: np.ndarray,
-    solution: np.ndarray,
-    covariance: np.ndarray,
+    prior: np.ndarray,
     free: np.ndarray,
     own: np.ndarray,
 ) -> float:
-    """Factor, at least 1, by which the offsets' variance exceeds that of the noise model.
+    """Factor by which the offsets' variance exceeds that of the noise model.
 
-    Cluster-robust sandwich variance over model variance, mean over the cameras. A cluster is a
-    group of keypoints with correlated errors: each of the 25 body points on its own, the 8 points
-    of each hand, and the 8 points of the face. Its score is the sum of its keypoints' gradients at
-    the solution.
+    It is :data:`COMMON_ERRORS` times an estimated ratio, at least 1: the cluster-robust sandwich
+    variance over the model's variance, mean over the cameras. A cluster is a group of keypoints
+    with correlated errors: each of the 25 body points on its own, the 8 points of each hand, and
+    the 8 points of the face. Its score is the sum of its keypoints' gradients at the solution.
 
     Args:
         matrices: (K, n, n) normal matrix of each keypoint, n = 7C.
         vectors: (K, n).
-        solution: (n,).
-        covariance: (m, m) of the free unknowns.
+        prior: (n,) inverse variances of the prior about 0.
         free: (m,) indices of the free unknowns.
         own: indices of the offsets among the free unknowns.
     """
-    scores = (vectors - matrices @ solution)[:, free]
+    matrix = (matrices.sum(0) + np.diag(prior))[np.ix_(free, free)]
+    covariance = np.linalg.inv(matrix)
+    solution = covariance @ vectors.sum(0)[free]
+    scores = vectors[:, free] - matrices[np.ix_(np.arange(len(matrices)), free, free)] @ solution
     groups = np.zeros((28, len(free)))
     np.add.at(groups, np.r_[np.arange(25), np.repeat([25, 26, 27], 8)], scores)
     taking_part = (np.abs(groups).sum(1) > 0).sum()
     if taking_part < 3:
-        return 1.0
+        return COMMON_ERRORS
     spread = (groups @ covariance[:, own]) ** 2
     ratio = spread.sum(0) / np.diag(covariance)[own] * taking_part / (taking_part - 1)
-    return max(1.0, float(ratio.mean()))
+    return COMMON_ERRORS * max(1.0, float(ratio.mean()))
 
 
 def keypoints_by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:

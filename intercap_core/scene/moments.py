@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.formats.detections.read import PeopleOfImages
-from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.formats.recordings.synchronise import frame_interval, images_of_moments
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA
-from intercap_core.scene.keypoint_timing import TIMING_INFLATION, TimeOffsets, find_offsets
+from intercap_core.scene.keypoint_timing import TimeOffsets, find_offsets
 from intercap_core.scene.slips import Slips, constant_slip, find_slips
 from intercap_core.scene.start_times import find_starts
 from intercap_core.scene.starts import (
@@ -42,7 +42,7 @@ def check_stated_starts(
     rejected, step = starts.rejected.copy(), starts.step_s
     constant = constant_slip(slips.slip)
     for c in np.flatnonzero(stated.known & ~rejected):
-        start_sigma = TIMING_INFLATION * timing.sigma[c]
+        start_sigma = timing.sigma[c]
         if not np.isfinite(start_sigma):
             if constant[c] == 0:
                 continue
@@ -159,7 +159,7 @@ def find_moments(
     starts = (
         find_starts(detections, rig, times, available, master=master, stated=stated)
         if search
-        else StartTimes.as_stated(stated, float(np.median(np.diff(times))) if len(times) > 1 else 0)
+        else StartTimes.as_stated(stated, frame_interval(times))
     )
     subject = find_subject_views(AlignedPeople(detections, starts), rig, times)
     slips = find_slips(subject.keypoints, rig, times, fps, master=master)

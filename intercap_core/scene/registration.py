@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.scene.starts import PRIOR_OFFSET_S
 from intercap_core.scene.surfaces import DepthSurface
 
 # Smallest standard deviation assumed for point-to-plane residuals; tuned on the studio.
@@ -184,13 +183,11 @@ class Registration:
             rig: cameras as given.
             layers: surfaces by kind and moment.
             master: index of the master.
-            offset_sigma: (C,) prior standard deviation of the given offsets, seconds; None = that
-                of synchronised devices.
+            offset_sigma: (C,) prior standard deviation of the given offsets, seconds; None = 1 s,
+                practically no prior.
         """
         self.rig = rig
-        self._offset_sigma = (
-            np.full(len(rig), PRIOR_OFFSET_S) if offset_sigma is None else offset_sigma
-        )
+        self._offset_sigma = np.ones(len(rig)) if offset_sigma is None else offset_sigma
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
         for kind, moments in layers.items():

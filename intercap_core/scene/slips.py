@@ -117,7 +117,7 @@ def find_slips(
             )
         elif offset is None:
             # sub-frame offsets hide weak slips: remove their effect and search again
-            offset = estimate_offsets(motion, master).offset
+            offset = estimate_offsets(motion, master, np.zeros(len(rig))).offset
         else:
             break
     if slip.any():

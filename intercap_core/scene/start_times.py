@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.formats.recordings.synchronise import frame_interval
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.slips import longest_slip
 from intercap_core.scene.start_costs import SEARCHED, WITNESS, PairCosts, follow_rays
@@ -66,7 +67,7 @@ def find_starts(
         stated: starts from sound or the user; None = no statements.
     """
     views, sets = len(rig), len(times)
-    step = float(np.median(np.diff(times))) if sets > 1 else 0.0
+    step = frame_interval(times)
     known = stated or StatedStarts.nothing(views)
     as_stated = StartTimes.as_stated(known, step)
     if sets < 2 or views < 2:

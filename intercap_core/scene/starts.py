@@ -18,11 +18,9 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
+from intercap_core.formats.recordings.synchronise import in_step_sigma
 from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA
 
-# Standard deviation of the time offset of synchronised devices: of a uniform distribution over
-# +-0.017 s, half the time between frames of a Kinect.
-PRIOR_OFFSET_S = 0.01
 NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 
@@ -209,10 +207,8 @@ class StartTimes:
 
     @property
     def offset_sigma(self) -> np.ndarray:
-        """(C,) standard deviations of ``offset``, seconds: stated, else half a set if the cameras
-        started apart, else that of synchronised devices."""
-        usual = self.step_s / 2 if self.apart else PRIOR_OFFSET_S
-        return np.where(np.isfinite(self.sigma), self.sigma, usual)
+        """(C,) standard deviation of ``offset``, seconds: as stated, else :func:`in_step_sigma`."""
+        return np.where(np.isfinite(self.sigma), self.sigma, in_step_sigma(self.step_s))
 
     def with_slips(self, slip: np.ndarray) -> np.ndarray:
         """Delay (T, C) of each image, in sets, by start and slip together.

@@ -113,6 +113,19 @@ def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
     return shown
 
 
+def frame_interval(times: np.ndarray) -> float:
+    """Usual time between the sets at ``times`` (T,), seconds; a Kinect's for a single set."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+
+
+def in_step_sigma(interval: float) -> float:
+    """Standard deviation, seconds, of the time offset of an image in its nearest set.
+
+    The distribution is uniform over half an ``interval`` (seconds) before and after the set.
+    """
+    return interval / np.sqrt(12)
+
+
 def usual_steps(available: np.ndarray) -> np.ndarray:
     """Median number of sets (C,) from one image of a camera to its next; 1 for fewer than 2 images.
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, of_side
+from intercap_core.formats.recordings.synchronise import frame_interval, in_step_sigma
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.time_series import filled_linearly, limited_velocity
 
@@ -214,8 +215,8 @@ class MovingPerson:
             limited_velocity(self.joints, times, max_speed=8.0)
         )
         self._late = scene["time_offset"]
-        # undetermined offsets: 10 ms, the spread of offsets over recordings
-        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=0.01)
+        undetermined = in_step_sigma(frame_interval(times))
+        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=undetermined)
 
     def bones(self, t: int, c: int) -> np.ndarray:
         """Bones (B, 9) at the exposure of camera ``c`` in set ``t``, see :func:`build_bones`."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_INDEX
+from intercap_core.formats.recordings.synchronise import in_step_sigma
 from intercap_core.geometry.camera.triangulation import reproject, spread, triangulate
 from intercap_core.person.segmentation.person_volume import (
     MovingPerson,
@@ -56,13 +57,13 @@ def test_margins_include_uncertainty_of_keypoints_and_times() -> None:
         person(0.03, 0.0).bones_at(4)[:, 8], np.hypot(usual, 0.03), rtol=1e-5
     )
     # of the hand alone, which moves; a forearm's margin by that of its middle
-    fast = person(0.0, 0.01).bones(4, 1)[:, 8]
+    fast = person(0.0, in_step_sigma(1 / FPS)).bones(4, 1)[:, 8]
     still = np.isclose(fast, usual, rtol=1e-4)
     assert still.sum() > 10 and (fast[~still] > 0.026).sum() >= 20
     forearm = fast[~still].min()
-    assert forearm == pytest.approx(np.hypot(0.018, 0.5 * 0.01 * SPEED), rel=0.01)
+    assert forearm == pytest.approx(np.hypot(0.018, 0.5 * in_step_sigma(1 / FPS) * SPEED), rel=0.01)
     unknown = person(0.0, np.nan).bones(4, 1)[:, 8]
-    np.testing.assert_allclose(unknown, fast, rtol=1e-5)  # 10 ms
+    np.testing.assert_allclose(unknown, fast, rtol=1e-5)
 
 
 def test_points_scatter_by_their_stated_deviation() -> None:
