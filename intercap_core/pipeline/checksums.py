@@ -11,6 +11,7 @@ outputs may be lost without harm.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -33,9 +34,14 @@ _ROWS = 64  # rows read at a time, so that memory stays flat
 
 
 class InputChecksums:
-    """Checksums of input files by path, stored in the JSON file ``store``."""
+    """Checksums of input files by path, stored in the JSON file ``store``.
 
-    def __init__(self, store: Path) -> None:
+    With ``one_look``, sizes and dates are those of the first call for a path. A job does without:
+    files may change while it runs.
+    """
+
+    def __init__(self, store: Path, *, one_look: bool = False) -> None:
+        self._stamp = functools.cache(_input_stamp) if one_look else _input_stamp
         self._store = store
         self._known = read_pairs(store)
         self._changed = False
@@ -51,7 +57,7 @@ class InputChecksums:
                 differs.
         """
         try:
-            stamp, size = _input_stamp(path)
+            stamp, size = self._stamp(path)
         except (OSError, ValueError):
             return "missing"
         if not stamp:

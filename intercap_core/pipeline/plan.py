@@ -217,7 +217,8 @@ class Plan:
 
     def _decide(self, sequence: str) -> Iterator[tuple[str, OutputState]]:
         """Yield each stage and the state of its output, in the order of the stages."""
-        checksums = InputChecksums(self.project.results / sequence / INPUTS_FILE)
+        store = self.project.results / sequence / INPUTS_FILE
+        checksums = InputChecksums(store, one_look=True)
         new_recording = ""
         if self.project.recordings_made(sequence) is not None:
             state = self._decide_studio(sequence, checksums)

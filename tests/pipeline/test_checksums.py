@@ -249,6 +249,19 @@ def test_digest_of_a_folder_follows_its_files(tmp_path: Path) -> None:
     assert inputs.digest(folder) != first
 
 
+def test_one_look_sees_each_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, store, looks = tmp_path / "k1.mkv", tmp_path / ".inputs.json", []
+    file.write_bytes(b"images")
+    first = InputChecksums(store).digest(file)
+    take = checksums._input_stamp
+    monkeypatch.setattr(checksums, "_input_stamp", lambda path: looks.append(path) or take(path))
+    inputs = InputChecksums(store, one_look=True)
+    assert inputs.digest(file) == first and inputs.digest(file) == first
+    assert len(looks) == 2  # before and after it was read
+    file.write_bytes(b"others")
+    assert inputs.digest(file) == first != InputChecksums(store, one_look=True).digest(file)
+
+
 def _rewrite(path: Path, content: bytes) -> None:
     """Overwrite in place with the size and dates of before."""
     before = path.stat()
