@@ -107,9 +107,9 @@ def viewer_payload(opened: Opened) -> str:
 def _final_result(
     header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the data without the fits before the final one and without truth: half the size."""
+    """Return the data of the final fit without the cameras' images, which the page has already."""
     shown, *others = header["versions"]
-    removed = tuple(f"{name}/" for name in (*others, "truth"))
+    removed = tuple(f"{name}/" for name in (*others, "truth", "images"))
     versions = {shown: header["versions"][shown]}
     kept = {name: values for name, values in arrays.items() if not name.startswith(removed)}
     return header | {"versions": versions}, kept

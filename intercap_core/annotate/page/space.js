@@ -198,10 +198,7 @@ function skinPaint(header, arrays) {
 function viewerElement() {
   const part = (tag, name, more = {}, ...children) => make(tag, { ...more, data: { part: name } }, ...children);
   const root = make("div", { class: "viewer", tabIndex: 0, role: "group" },
-    part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" }),
-    make("div", { class: "time", hidden: true }, part("button", "play", { type: "button" }),
-      make("div", { class: "track" }, part("input", "scrub", { type: "range", min: "0", max: "0", value: "0", "aria-label": "Frame" }), part("canvas", "marks"))),
-    make("div", { class: "row", hidden: true }, part("span", "time"), part("span", "flag"), part("select", "speed", { "aria-label": "Speed" })),
+    make("div", { class: "stage" }, part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" })),
     make("details", {}, make("summary", {}, "3D view"), part("div", "layers", { role: "group", "aria-label": "Shown in 3D" }),
       make("label", {}, "view ", part("select", "views", {}, new Option("free", "-1"))), part("button", "reset", { type: "button" }, "Overview")));
   root.setAttribute("aria-label", "Sequence in 3D over time");

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 MESH_FACES = 20000  # an object with more faces is simplified
+IMAGE_WIDTH = 640  # pixels of the cameras' images, if the recorded ones are not smaller
 VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
 
 
@@ -70,6 +71,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         zup, rig, image_of = scene["zup_from_master"], Rig.from_artefact(scene), scene["image_of"]
         bias = scene["depth_bias"]
         upright = z_up_frame(scene)
+        floor = bool(scene.attributes["ground_found"])
     bodies: dict[str, _Body] = {}
     flags: Sequence[str] = ()
     imported = False
@@ -110,6 +112,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             "fps": images.fps,
             "frames": total,
             "frame": upright,
+            "floor": floor,
             "moments": moments.tolist(),
             "versions": {name: names[name] for name in bodies},
             "object": "" if mesh is None else mesh.name,
@@ -230,7 +233,10 @@ def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
 
 
 def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray) -> None:
-    """Add concatenated undistorted JPEGs of the frames ``moments`` by camera, and their offsets."""
+    """Add concatenated undistorted images (WebP) of the frames ``moments``, and their offsets.
+
+    They are ordered by frame, then by camera.
+    """
     data, starts = [], [0]
     names = [camera["name"] for camera in content.header["cameras"]]
     for t in moments:
@@ -238,16 +244,18 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
             if camera.name not in names:
                 continue
             packet = b""
+            lens = camera.colour.scaled(min(1.0, IMAGE_WIDTH / camera.colour.width))
+            factors: tuple[Literal[1, 2, 4], ...] = (4, 2, 1)  # by which the decoder can reduce
+            factor = next(f for f in factors if camera.colour.width >= f * lens.width)
             try:
-                image = images.colour(int(t), c, reduction=4)
+                image = images.colour(int(t), c, factor)
             except UserError:  # the stages report images that do not decode
                 image = None
             if image is not None:
-                lens = camera.colour.scaled(256 / camera.colour.width)
                 small = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
                 small = cv2.undistort(small, lens.matrix, lens.distortion)
-                options = [cv2.IMWRITE_JPEG_QUALITY, 70]
-                packet = cv2.imencode(".jpg", small, options)[1].tobytes()
+                options = [cv2.IMWRITE_WEBP_QUALITY, 60]
+                packet = cv2.imencode(".webp", small, options)[1].tobytes()
             data.append(packet)
             starts.append(starts[-1] + len(packet))
     content.arrays["images/data"] = np.frombuffer(b"".join(data), np.uint8)

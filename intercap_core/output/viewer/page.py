@@ -20,6 +20,7 @@ from intercap_core.output.viewer.content import gather
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SCRIPT = "viewer.js"
+CODE = ("three.js", "meshes.js", "compare.js", "viewer.js")
 # The script has the same origin on a server and scheme file: on disk; images are made from data.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
@@ -66,9 +67,7 @@ _TYPES = {"float32": "<f4", "uint32": "<u4", "uint16": "<u2", "int16": "<i2", "u
 
 def script(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """Return the viewer's code and data as a classic script."""
-    code = "\n".join(
-        (DATA / name).read_text(encoding="utf-8") for name in ("three.js", "viewer.js")
-    )
+    code = "\n".join((DATA / name).read_text(encoding="utf-8") for name in CODE)
     return f'{code}\nshowInterCap("{payload(header, arrays)}");\n'
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from intercap_core import artefacts
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.output.viewer import page
-from intercap_core.output.viewer.content import gather
+from intercap_core.output.viewer.content import Content, gather
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
@@ -25,6 +27,11 @@ NAME = "s01_o03"
 @pytest.fixture(scope="module")
 def capture(captures: dict[str, fitted.Capture]) -> fitted.Capture:
     return captures[NAME]
+
+
+def _gather_all(capture: fitted.Capture) -> Content:
+    stages = (stage for stage in capture.paths if stage != "truth")
+    return gather(capture.inputs(*stages), capture.models, truth=capture.paths["truth"])
 
 
 def _write(capture: fitted.Capture, folder: Path, name: str = NAME, **without: bool) -> Path:
@@ -83,8 +90,10 @@ def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> 
         result.played = viewer.state.frame;
         const layers = [...root.querySelectorAll("[data-layer]")];
         result.layers = layers.map((label) => label.dataset.layer);
-        key("2"); result.sequential = viewer.versions.sequential.group.visible;
-        key("1"); result.joint = viewer.versions.joint.group.visible;
+        root.querySelector('[data-part="loop"]').click();
+        key(" "); await become(() => viewer.state.frame === 1); key(" ");
+        root.querySelector('[data-part="back"]').click(); result.back = viewer.state.frame;
+        key("2"); result.contact = viewer.state.contact;
         result.images = viewer.header.cameras.length;
         """,
         "#t=0.14",
@@ -96,9 +105,103 @@ def test_loads_plays_and_seeks_without_an_error(shown: Path, tmp_path: Path) -> 
     assert (result["right"], result["end"], result["home"]) == (3, FRAMES - 1, 0)
     assert result["address"] == "#t=0.20"
     assert result["playing"] and result["played"] == FRAMES - 1
-    assert result["layers"][:3] == ["joint", "sequential", "truth"]
-    assert {"object", "contact", "clouds", "cameras", "images"} <= set(result["layers"])
-    assert result["sequential"] and not result["joint"] and result["images"] == 3
+    assert result["layers"] == ["object", "contact", "clouds", "cameras", "images"]
+    assert result["back"] == 0 and not result["contact"] and result["images"] == 3
+
+
+@needs_chromium
+def test_it_starts_at_the_first_contact(capture: fitted.Capture, shown: Path) -> None:
+    bits = _gather_all(capture).arrays["contact/touching"]
+    first = int(np.flatnonzero(bits.any(1))[0])
+    assert _browse(shown, "result.frame = viewer.state.frame;")["result"]["frame"] == first
+
+
+@needs_chromium
+def test_the_address_restores_camera_layers_and_comparison(shown: Path) -> None:
+    link = "#t=0.20&layers=object&other=truth&how=distance"
+    script = """
+        const { joint, truth } = viewer.versions;
+        const place = ({ mesh }) => [...mesh.geometry.attributes.position.array];
+        result.bodies = [place(joint), place(truth)];
+        result.legend = root.querySelector('[data-part="legend"]').textContent;
+        result.shown = [joint.group.visible, truth.group.visible];
+        viewer.compare({ how: "split" });
+        result.split = location.hash;
+        const titles = root.querySelectorAll('[data-part="titles"] span');
+        result.titles = [...titles].map((title) => title.textContent);
+    """
+    found = _browse(shown, script, link)
+    result = found["result"]
+    assert found["console"] == [] and result["split"] == link.replace("distance", "split")
+    joint, truth = (np.reshape(body, (-1, 3)) for body in result["bodies"])
+    mean = 1e3 * np.linalg.norm(joint - truth, axis=1).mean()
+    told = re.fullmatch(r"distance to truth, 0 to (\d+) mm; mean ([\d.]+) mm", result["legend"])
+    assert told is not None, result["legend"]
+    assert result["shown"] == [True, False] and result["titles"] == ["joint fit", "truth"]
+    assert float(told[2]) == pytest.approx(mean, rel=0.1) and float(told[1]) > mean
+    eye = _browse(shown, "result.eye = viewer.eye.position.toArray();", "#t=0.20&eye=1,2,3,0,0,1")
+    assert eye["result"]["eye"] == pytest.approx([1, 2, 3])
+    through = _browse(
+        shown, "result.view = viewer.eye.fov; result.hash = location.hash;", "#t=0.2&view=k2"
+    )
+    assert through["result"]["view"] != 40
+
+
+@needs_chromium
+def test_the_wheel_scrolls_the_page_until_the_picture_is_clicked(shown: Path) -> None:
+    with visit(shown, size=(900, 500)) as visited:
+        visited.wait()
+        page = visited.page
+        far, _ = _far(visited)
+
+        def wheel(by: int) -> tuple[float, float]:
+            page.mouse.wheel(0, by)
+            page.wait_for_timeout(200)
+            return page.evaluate("scrollY"), _far(visited)[0]
+
+        page.mouse.move(450, 250)
+        scrolled, same = wheel(60)
+        assert scrolled == 60 and same == far
+        page.keyboard.down("Control")
+        scrolled, near = wheel(-60)
+        page.keyboard.up("Control")
+        assert scrolled == 60 and near < far
+        page.mouse.click(450, 250)
+        assert wheel(60)[0] == 60 and _far(visited)[0] > near
+        page.mouse.click(4, 250)
+        page.mouse.move(450, 250)
+        assert wheel(-60)[0] == 0
+
+
+@needs_chromium
+def test_a_distance_is_measured_and_follows_the_object(shown: Path) -> None:
+    look_from = """(side) => { // at the ball, from 20 cm away along x
+      const { versions, eye, draw } = intercapViewer, { mesh } = versions.joint.object;
+      mesh.geometry.computeBoundingSphere();
+      const middle = mesh.geometry.boundingSphere.center.clone().applyMatrix4(mesh.matrix);
+      eye.position.copy(middle).x += 0.2 * side;
+      eye.lookAt(middle);
+      draw();
+      return mesh.geometry.boundingSphere.radius;
+    }"""
+    with visit(shown, size=SIZE, address="#t=0") as visited:
+        visited.wait()
+        page = visited.page
+        page.get_by_role("button", name="Measure").click()
+        box = page.locator("[data-part=canvas]").bounding_box()
+        assert box is not None
+        for side in (1, -1):
+            radius = page.evaluate(look_from, side)
+            page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        metres = page.evaluate("intercapViewer.measurement.metres")
+        assert metres == pytest.approx(2 * radius, rel=0.02)
+        assert page.locator("[data-part=measured]").inner_text() == f"distance: {metres:.3f} m"
+        point = "intercapViewer.measurement.points[0]().toArray()"
+        before = page.evaluate(point)
+        page.evaluate("intercapViewer.show(3)")
+        assert np.linalg.norm(np.subtract(before, page.evaluate(point))) > 0.001
+        assert page.evaluate("intercapViewer.measurement.metres") == pytest.approx(metres, abs=1e-4)
+        assert visited.console == []
 
 
 def _expected_pixels(
@@ -133,6 +236,9 @@ def test_body_and_object_are_where_the_camera_sees_them(
         """
         for (const name of ["contact", "cameras"])
           root.querySelector(`[data-layer="${name}"] input`).click();
+        const opacity = root.querySelector('[data-part="opacity"]');
+        opacity.value = 0;
+        opacity.dispatchEvent(new Event("input"));
         viewer.show(3); viewer.look(0); await pause(300); viewer.draw();
         const box = root.querySelector("canvas").getBoundingClientRect();
         result.box = { left: box.left, top: box.top, width: box.width, height: box.height };
@@ -155,11 +261,9 @@ def test_body_and_object_are_where_the_camera_sees_them(
 
 
 @needs_chromium
-def test_layers_change_the_picture(shown: Path, tmp_path: Path) -> None:
-    off = 'root.querySelector(`[data-layer="joint"] input`).click(); await pause(100);'
-    pictures = [
-        _browse(shown, script)["picture"].astype(int) for name, script in (("on", ""), ("off", off))
-    ]
+def test_another_result_changes_the_picture(shown: Path) -> None:
+    script = "viewer.compare({ shown: 'truth' }); await pause(100);"
+    pictures = [_browse(shown, then)["picture"].astype(int) for then in ("", script)]
     assert (np.abs(pictures[0] - pictures[1]).max(2) > 40).mean() > 0.01
 
 
@@ -211,9 +315,9 @@ def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
         page.get_by_role("button", name="Play").tap()  # from the start, as it stood at the end
         visited.wait("!intercapViewer.state.playing")
         assert page.evaluate("location.hash") == f"#t={(FRAMES - 1) / fitted.FPS:.2f}"
-        page.get_by_label("truth").tap()
+        page.get_by_label("compared with").select_option("truth")
         assert page.evaluate("intercapViewer.versions.truth.group.visible")
-        for control in page.locator(".viewer :is(button, select, label)").all():
+        for control in page.locator(".viewer :is(button, select, label):visible").all():
             at = control.bounding_box()
             assert at is not None and at["height"] >= 40, control.inner_text()
         assert visited.console == []
@@ -251,11 +355,13 @@ def test_the_viewer_needs_only_the_body_fit(capture: fitted.Capture, tmp_path: P
     found = gather(capture.inputs("frames", "scene", "body_fit"), capture.models)
     assert list(found.header["versions"]) == ["sequential"] and found.header["object"] == ""
     assert "clouds/person" not in found.arrays and found.header["frames"] == FRAMES
-    whole = gather(
-        capture.inputs(*(stage for stage in capture.paths if stage != "truth")), capture.models,
-        truth=capture.paths["truth"],
-    )  # fmt: skip
+    whole = _gather_all(capture)
     assert list(whole.header["versions"]) == ["joint", "sequential", "truth"]
     starts = whole.arrays["clouds/person_starts"]
     assert len(starts) == len(whole.header["moments"]) + 1 and starts[-1] > 0
     assert max(whole.header["error_mm"].values()) <= 1.0
+    with artefacts.read(capture.paths["scene"], SCENE) as scene:
+        assert whole.header["floor"] == bool(np.isfinite(scene["ground_point"]).all())
+    data, (first, last) = whole.arrays["images/data"], whole.arrays["images/starts"][:2]
+    image = cv2.imdecode(data[first:last], cv2.IMREAD_COLOR)
+    assert image.shape[1] == min(640, whole.header["cameras"][0]["size"][0])
