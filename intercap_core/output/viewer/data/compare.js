@@ -31,21 +31,24 @@ function paintContact(mesh, frame, header, arrays, base, on) {
   colours.needsUpdate = true;
 }
 
-/* Colour meshes by the distances of their vertices, metres. Returns { largest, mean }, metres; `largest` is the
- * end of the scale: 1, 2 or 5 times a power of ten. */
-function paintDistances(meshes, distances) {
-  const all = distances.flatMap((values) => [...values]);
+/* Colour body and object of a version by the distances of their vertices to those of another version; returns
+ * the scale and the mean in words. The end of the scale is 1, 2 or 5 times a power of ten. */
+function paintDistances(shown, other) {
+  const pairs = [[shown.mesh, other.mesh], [shown.object?.mesh, other.object?.mesh]].filter(([a, b]) => a?.visible && b?.visible);
+  const known = pairs.map(([mesh, to]) => ({ mesh, distances: vertexDistances(mesh, to) })).filter(({ distances }) => distances);
+  const all = known.flatMap(({ distances }) => [...distances]);
   const most = all.reduce((a, b) => Math.max(a, b), 1e-4), ten = 10 ** Math.floor(Math.log10(most));
   const largest = ten * [1, 2, 5, 10].find((step) => most <= step * ten);
-  meshes.forEach((mesh, m) => {
+  for (const { mesh, distances } of known) {
     const colours = mesh.geometry.attributes.color;
-    distances[m].forEach((distance, v) => {
+    distances.forEach((distance, v) => {
       const at = (2 * distance) / largest, k = at < 1 ? 0 : 1;
       colours.setXYZ(v, ...DISTANCES[k].map((low, i) => low + (at - k) * (DISTANCES[k + 1][i] - low)));
     });
     colours.needsUpdate = true;
-  });
-  return { largest, mean: all.reduce((sum, distance) => sum + distance, 0) / all.length };
+  }
+  const mm = (metres) => Number((1000 * metres).toPrecision(2));
+  return `0 to ${mm(largest)} mm; mean ${mm(all.reduce((sum, distance) => sum + distance, 0) / all.length)} mm`;
 }
 
 /* Distances between the vertices of two posed meshes, metres; null if they are different meshes. */

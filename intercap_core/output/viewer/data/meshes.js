@@ -180,3 +180,59 @@ function cameraOf(camera) {
   for (const part of [frustum, plane]) part.applyMatrix4(pose);
   return { ...camera, pose, frustum, plane, place };
 }
+
+/* Images on the planes of the cameras. That of the camera through which the user looks is also drawn over body
+ * and object, by `overlay` with its opacity. */
+class CameraImages {
+  constructor(cameras, arrays, draw) {
+    Object.assign(this, { cameras, arrays, draw, through: undefined });
+    this.overlay = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial(
+      { side: THREE.DoubleSide, toneMapped: false, transparent: true, opacity: 0.3, depthTest: false, depthWrite: false }));
+    this.overlay.matrixAutoUpdate = false;
+    this.overlay.renderOrder = 1;
+    this.overlay.visible = false;
+  }
+
+  /* Look through a camera; undefined = none. */
+  lookThrough(camera) {
+    this.through = camera;
+    this.overlay.visible = false;
+    if (!camera) return;
+    this.overlay.geometry = camera.plane.geometry;
+    this.overlay.matrix.copy(camera.pose);
+  }
+
+  hide(camera) {
+    camera.request = null;
+    camera.plane.visible = false;
+    if (camera === this.through) this.overlay.visible = false;
+  }
+
+  /* Show the image of a moment. */
+  show(camera, moment) {
+    const starts = this.arrays["images/starts"] ?? [], place = moment * this.cameras.length + camera.index;
+    const [first, last] = [starts[place], starts[place + 1]];
+    if (first === last) {
+      this.hide(camera);
+      return;
+    }
+    const url = URL.createObjectURL(new Blob([this.arrays["images/data"].subarray(first, last)], { type: "image/webp" }));
+    const image = new Image();
+    const request = (camera.request = Symbol("image"));
+    image.onload = () => {
+      URL.revokeObjectURL(url);
+      if (camera.request !== request) return; // a later request replaced this one
+      const texture = new THREE.Texture(image);
+      texture.colorSpace = THREE.SRGBColorSpace;
+      texture.needsUpdate = true;
+      camera.plane.material.map?.dispose();
+      for (const mesh of [camera.plane, ...(camera === this.through ? [this.overlay] : [])]) {
+        mesh.material.map = texture;
+        mesh.material.needsUpdate = true;
+        mesh.visible = true;
+      }
+      this.draw();
+    };
+    image.src = url;
+  }
+}

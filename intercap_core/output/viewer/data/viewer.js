@@ -27,10 +27,7 @@ async function showInterCap(payload) {
   let renderer;
   try {
     renderer = new THREE.WebGLRenderer({ canvas: find("canvas"), antialias: true });
-  } catch {
-    say("This browser cannot draw in 3D (WebGL is disabled or missing).");
-    return;
-  }
+  } catch { return say("This browser cannot draw in 3D (WebGL is disabled or missing)."); }
   renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
   const scene = new THREE.Scene();
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
@@ -73,50 +70,9 @@ async function showInterCap(payload) {
     frusta.add(frustum);
     planes.add(plane);
   }
-  // the image of the camera through which the user looks, over body and object
-  const overlay = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial(
-    { side: THREE.DoubleSide, toneMapped: false, transparent: true, depthTest: false, depthWrite: false }));
-  overlay.matrixAutoUpdate = false;
-  overlay.renderOrder = 1;
-  scene.add(clouds.group, frusta, planes, overlay);
+  const images = new CameraImages(cameras, arrays, () => draw());
+  scene.add(clouds.group, frusta, planes, images.overlay);
   let through = -1; // camera whose view is shown, -1 = free view
-  /* Show the image of a moment on the camera's plane. */
-  const showImage = (camera, moment) => {
-    const starts = arrays["images/starts"] ?? [];
-    const place = moment * cameras.length + camera.index;
-    const [first, last] = [starts[place], starts[place + 1]];
-    if (first === last) {
-      hideImage(camera);
-      return;
-    }
-    const url = URL.createObjectURL(
-      new Blob([arrays["images/data"].subarray(first, last)], { type: "image/webp" }));
-    const image = new Image();
-    const request = (camera.request = Symbol("image"));
-    image.onload = () => {
-      URL.revokeObjectURL(url);
-      if (camera.request !== request) return; // a later request replaced this one
-      const texture = new THREE.Texture(image);
-      texture.colorSpace = THREE.SRGBColorSpace;
-      texture.needsUpdate = true;
-      camera.plane.material.map?.dispose();
-      camera.plane.material.map = texture;
-      camera.plane.material.needsUpdate = true;
-      camera.plane.visible = true;
-      if (camera.index === through) {
-        overlay.material.map = texture;
-        overlay.material.needsUpdate = true;
-        overlay.visible = true;
-      }
-      draw();
-    };
-    image.src = url;
-  };
-  const hideImage = (camera) => {
-    camera.request = null;
-    camera.plane.visible = false;
-    if (camera.index === through) overlay.visible = false;
-  };
 
   // ------------------------------------------------------------------ controls
   const state = {
@@ -172,8 +128,7 @@ async function showInterCap(payload) {
   const views = find("views");
   cameras.forEach((camera, c) => views.append(new Option(`through ${camera.name}`, c)));
   views.addEventListener("change", () => look(Number(views.value)));
-  find("opacity").addEventListener("input", (event) => { overlay.material.opacity = Number(event.target.value); draw(); });
-  overlay.material.opacity = 0.3;
+  find("opacity").addEventListener("input", (event) => { images.overlay.material.opacity = Number(event.target.value); draw(); });
   find("speed").addEventListener("change", (event) => (state.speed = Number(event.target.value)));
   find("loop").addEventListener("change", (event) => (state.loop = event.target.checked));
   const scrub = find("scrub");
@@ -232,7 +187,7 @@ async function showInterCap(payload) {
 
   /* The wheel and vertical strokes of a finger scroll the page until the user clicks the canvas; the wheel zooms
    * with Ctrl, and always on a page that does not scroll. */
-  const canvas = renderer.domElement;
+  const canvas = find("canvas");
   let active = false, pressed = null;
   const activate = (on) => { active = on; canvas.style.touchAction = on ? "none" : "pan-y"; };
   activate(false);
@@ -292,8 +247,8 @@ async function showInterCap(payload) {
       moment = now;
       if (clouds.group.visible) clouds.show(now);
       for (const camera of cameras) {
-        if (state.images || camera.index === through) showImage(camera, now);
-        else hideImage(camera);
+        if (state.images || camera.index === through) images.show(camera, now);
+        else images.hide(camera);
       }
     }
     scrub.value = frame;
@@ -314,26 +269,17 @@ async function showInterCap(payload) {
   };
   /* Colour the shown version by the distance to the compared one; write the legend or the titles of both. */
   const paintDifference = (frame) => {
-    const [shown, other] = [versions[state.shown], versions[state.other]], name = (key) => header.versions[key];
-    const at = (key) => versions[key].storedAt?.(frame) ?? frame;
-    const titles = panes().map((key) => `${name(key)}${at(key) === frame ? "" : `, frame ${at(key)}`}`);
+    const at = (key) => versions[key].storedAt?.(frame) ?? frame; // the truth is not stored in all frames
+    const titles = panes().map((key) => `${header.versions[key]}${at(key) === frame ? "" : `, frame ${at(key)}`}`);
     find("titles").replaceChildren(...(titles.length > 1 || at(state.shown) !== frame ? titles : []).map((text) => {
       const title = document.createElement("span");
       title.textContent = text;
       return title;
     }));
-    const colours = other && state.how === "distance";
+    const colours = state.other && state.how === "distance", away = [state.shown, state.other].find((key) => colours && at(key) !== frame);
     find("legend").hidden = !colours;
-    if (!colours) return;
-    const pairs = [[shown.mesh, other.mesh], [shown.object?.mesh, other.object?.mesh]].filter(([a, b]) => a?.visible && b?.visible);
-    const known = pairs.map(([a, b]) => [a, vertexDistances(a, b)]).filter(([, distances]) => distances);
-    const away = [state.shown, state.other].find((key) => at(key) !== frame);
-    if (away) find("legend").textContent = `${name(away)} is stored in frame ${at(away)}, not in frame ${frame}: no distances`;
-    else {
-      const { largest, mean } = paintDistances(known.map(([mesh]) => mesh), known.map(([, distances]) => distances));
-      const mm = (metres) => Number((1000 * metres).toPrecision(2));
-      find("legend").textContent = `distance to ${name(state.other)}, 0 to ${mm(largest)} mm; mean ${mm(mean)} mm`;
-    }
+    if (away) find("legend").textContent = `${header.versions[away]} is stored in frame ${at(away)}, not in frame ${frame}: no distances`;
+    else if (colours) find("legend").textContent = `distance to ${header.versions[state.other]}, ${paintDistances(versions[state.shown], versions[state.other])}`;
   };
   const draw = () => {
     const { clientWidth: width, clientHeight: height } = canvas;
@@ -367,22 +313,20 @@ async function showInterCap(payload) {
     views.value = c;
     controls.enabled = c < 0;
     find("image").hidden = c < 0 || !arrays["images/starts"];
-    overlay.visible = false;
+    images.lookThrough(cameras[c]);
     if (c < 0) {
       eye.fov = 40;
       eye.up.set(0, 0, 1);
       eye.clearViewOffset();
       overview();
     } else {
-      const { pose, place, plane } = cameras[c];
+      const { pose, place } = cameras[c];
       const x = new THREE.Vector3(), y = new THREE.Vector3(), z = new THREE.Vector3();
       pose.extractBasis(x, y, z);
       eye.position.setFromMatrixPosition(pose);
       eye.up.copy(y.negate());
       eye.lookAt(eye.position.clone().add(z));
       place(12); // the image is behind the scene
-      overlay.geometry = plane.geometry;
-      overlay.matrix.copy(pose);
     }
     show(state.frame, true);
   };
