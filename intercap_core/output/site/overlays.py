@@ -135,7 +135,13 @@ def overlays(
 
 
 def draw_over(
-    images: Frames, rig: Rig, c: int, posed: Mapping[int, Sequence[PosedMesh]], *, rows: int
+    images: Frames,
+    rig: Rig,
+    c: int,
+    posed: Mapping[int, Sequence[PosedMesh]],
+    *,
+    rows: int,
+    opacity: float = 0.62,
 ) -> dict[int, np.ndarray]:
     """Draw meshes over the images of camera ``c``, cropped to the part that shows all of them.
 
@@ -143,6 +149,7 @@ def draw_over(
         images: images by the frame that they show (:meth:`Frames.showing`).
         posed: meshes by frame.
         rows: largest height of a picture, pixels.
+        opacity: of the meshes, 0 to 1.
 
     Returns:
         RGB pictures (H, W, 3) in 0..1 by frame, all of one size; missing images are left out.
@@ -170,7 +177,7 @@ def draw_over(
             for m in meshes
         ]
         picture = draw(coloured, lens)
-        pictures[t] = picture.over(crop[..., ::-1] / np.float32(255), opacity=0.62)
+        pictures[t] = picture.over(crop[..., ::-1] / np.float32(255), opacity)
     return pictures
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -27,9 +26,17 @@ class Preview:
     still: EncodedImage
     """A frame of it, for readers who prefer no motion."""
     thumbnail: EncodedImage
-    """The same frame, small."""
+    """The same frame, small, cropped to body and object."""
     camera: str
     """Name of the camera."""
+
+
+def middle_of_contact(measured: SequenceMetrics) -> int:
+    """Return the middle of the contact frames, or of the sequence if nothing is in contact."""
+    frames = range(len(measured))
+    if measured.has_object and measured.values["contact_frame"].any():
+        frames = np.flatnonzero(measured.values["contact_frame"]).tolist()
+    return int(frames[len(frames) // 2])
 
 
 def make_preview(
@@ -37,25 +44,22 @@ def make_preview(
 ) -> Preview | None:
     """Draw the preview; None if camera ``c`` has no image that shows the fit.
 
-    The still shows the middle of the contact frames, or of the sequence without contact.
+    The still shows :func:`middle_of_contact`.
 
     Args:
         images: images by the frame that they show (:meth:`Frames.showing`).
     """
-    total = len(measured)
-    touching = np.flatnonzero(measured.values.get("contact_frame", np.zeros(total)))
-    middle = int(touching[len(touching) // 2]) if len(touching) else total // 2
+    total, middle = len(measured), middle_of_contact(measured)
     spread = np.linspace(0, total - 1, min(_PICTURES, total)).round().astype(int)
     frames = sorted({middle, *spread.tolist()})
     pictures = draw_over(images, rig, c, {t: fit.at(t) for t in frames}, rows=_ROWS)
     if not pictures:
         return None
-    still = pictures[min(pictures, key=lambda t: abs(t - middle))]
-    scale = min(1.0, _THUMBNAIL_ROWS / len(still))
-    small = cv2.resize(still, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    nearest = min(pictures, key=lambda t: abs(t - middle))
+    small = draw_over(images, rig, c, {nearest: fit.at(nearest)}, rows=_THUMBNAIL_ROWS)
     return Preview(
         encode_animation(list(pictures.values()), total / measured.fps),
-        encode_jpeg(still),
-        encode_jpeg(small),
+        encode_jpeg(pictures[nearest]),
+        encode_jpeg(small[nearest]),
         rig.names[c],
     )
