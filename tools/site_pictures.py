@@ -34,7 +34,7 @@ def main(site: Path, output: Path) -> None:
             executable_path=shutil.which("chromium"), args=_OPTIONS, chromium_sandbox=False
         )
         _write(output / "site_overview.jpg", _taken(browser, overview, DESK, "h1"))
-        _write(output / "site_sequence.jpg", _taken(browser, sequence, DESK, "#viewer"))
+        _write(output / "site_sequence.jpg", _taken(browser, sequence, DESK, "h1"))
         phone = [
             _taken(browser, page, PHONE, place)
             for page, place in (
