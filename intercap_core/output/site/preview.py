@@ -33,10 +33,10 @@ class Preview:
 
 def middle_of_contact(measured: SequenceMetrics) -> int:
     """Return the middle of the contact frames, or of the sequence if nothing is in contact."""
-    frames = range(len(measured))
+    frames = list(range(len(measured)))
     if measured.has_object and measured.values["contact_frame"].any():
         frames = np.flatnonzero(measured.values["contact_frame"]).tolist()
-    return int(frames[len(frames) // 2])
+    return frames[len(frames) // 2]
 
 
 def make_preview(
