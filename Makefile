@@ -64,7 +64,7 @@ imports: $(STAMP)
 	$(BIN)/lint-imports
 
 snakefmt: $(STAMP)
-	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/snakefmt --check workflow
 
 mypy: $(STAMP)
 	$(BIN)/mypy

@@ -22,7 +22,7 @@ def page() -> str:
     done = subprocess.run(
         [
             *(sys.executable, "-m", "snakemake", "--rulegraph", "mermaid-js", "--quiet", "all"),
-            *("--snakefile", "Snakefile", "--configfile", "config/demo/config.yaml", "--forceall"),
+            *("--configfile", "config/demo/config.yaml", "--forceall"),
         ],
         cwd=ROOT,
         check=True,

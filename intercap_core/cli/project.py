@@ -145,7 +145,7 @@ def run(
     cores: Cores = 0,
     profile: Annotated[
         Path | None,
-        typer.Option(help="Snakemake workflow profile: profiles/slurm for a Slurm cluster."),
+        typer.Option(help="Snakemake workflow profile, a folder or a name: slurm for a cluster."),
     ] = None,
 ) -> None:
     """Compute everything that is missing or out of date, and show the progress.
@@ -155,7 +155,7 @@ def run(
 
     Examples: intercap run config/demo/config.yaml;
     intercap run config/demo/config.yaml --cores 2 -- --until joint;
-    intercap run config/lab/config.yaml --profile profiles/slurm
+    intercap run config/lab/config.yaml --profile slurm
     """
     from intercap_core.commands.run import run_workflow
 

@@ -28,6 +28,7 @@ from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.lease import Lease, find_snakemake, lease_path, try_acquire
 from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
+from intercap_core.shipped import shipped
 from intercap_core.signals import Terminated
 from intercap_core.stage_list import STAGES
 
@@ -64,7 +65,7 @@ def run_workflow(
 
     Args:
         cores: number of cores; 0 for all, or for the profile's.
-        profile: folder of a Snakemake workflow profile.
+        profile: folder of a Snakemake workflow profile, or name of one of the package.
         arguments: further arguments of Snakemake; paths are relative to the project's root.
     """
     project = load_project(settings)
@@ -205,26 +206,21 @@ def snakemake_command(
 
     Arguments as of :func:`run_workflow`.
     """
-    if profile is not None and not profile.is_dir():
-        raise UserError(f"{profile}: is no folder; name a profile such as profiles/slurm")
+    profiles = shipped("workflow/profiles")
+    if profile is not None:
+        places = [path for path in (profile, profiles / profile.name) if path.is_dir()]
+        if not places:
+            known = ", ".join(sorted(path.name for path in profiles.iterdir()))
+            raise UserError(f"{profile}: is no folder and no profile of the package ({known})")
+        profile = places[0]
     return [
         *(sys.executable, "-m", "snakemake"),
-        *("--snakefile", str(snakefile())),
+        *("--snakefile", str(shipped("workflow/Snakefile"))),
         *("--configfile", project.target(project.path)),
         *(("--workflow-profile", os.path.abspath(profile)) if profile is not None else ()),
         *(("--cores", str(cores) if cores else "all") if cores or profile is None else ()),
         *arguments,
     ]
-
-
-def snakefile() -> Path:
-    """Path of the Snakefile of the package, or of one in the working directory."""
-    for folder in (Path(__file__).resolve().parents[2], Path.cwd()):
-        if (folder / "Snakefile").is_file():
-            return folder / "Snakefile"
-    raise UserError(
-        "no Snakefile in this folder; run in the folder that contains Snakefile and workflow/"
-    )
 
 
 class Watcher:

@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.helpers.flow import Flow
 from tests.helpers.loopback_slurm import LoopbackSlurm
 
-PROFILE = ("--workflow-profile", "profiles/slurm")
+PROFILE = ("--workflow-profile", "slurm")
 ENDS_WITHIN_S = 900.0
 
 

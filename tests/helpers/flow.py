@@ -18,7 +18,7 @@ from intercap_core.kernel_cache import use_kernel_cache
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
-COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core", EXECUTOR)
+COPIED = ("workflow", "config", "intercap_core", EXECUTOR)
 KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache next to the source
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
 # Appended to a stage of a copy, which then returns the result of a finished run. Its imports

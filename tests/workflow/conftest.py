@@ -32,7 +32,7 @@ def _run(flow: Flow, *targets: str) -> None:
 
 @pytest.fixture(scope="session")
 def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
-    """The same recordings without studio and truth in another folder, after `intercap run`.
+    """The same recordings without studio and truth in another folder, after init and run.
 
     The recordings of one of the two sequences are unreadable. The summary of the other one has been
     made by replay; its other results are those of ``flow``.
@@ -41,18 +41,17 @@ def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
         tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results
     )
     shutil.copytree(flow.results / "recordings", other.folder / "captures")
-    for path in (other.folder / "captures" / OTHER).glob("*.mkv"):
-        path.write_bytes(b"not a recording")
     for path in (other.folder / "captures").rglob("truth.h5"):
         path.unlink()
+    done = other.intercap(
+        *("init", "captures", "--output", "config/lab"),
+        *("--dataset", "test", "--objects", "config/objects.yaml"),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
     settings = other.folder / "config" / "lab"
-    settings.mkdir()
-    (settings / "config.yaml").write_text("dataset: test\nobjects: ../objects.yaml\n")
-    shutil.copy2(other.folder / "config" / "test" / "subjects.tsv", settings)
-    rows = (other.folder / "config" / "test" / "sequences.tsv").read_text().splitlines()
-    without_truth = [row.rpartition("\t")[0] for row in rows]
-    text = "\n".join(without_truth).replace("results/test/recordings", "captures") + "\n"
-    (settings / "sequences.tsv").write_text(text)
+    shutil.copy2(other.folder / "config" / "test" / "subjects.tsv", settings)  # genders
+    for path in (other.folder / "captures" / OTHER).glob("*.mkv"):
+        path.write_bytes(b"not a recording")
     for place in (ONE, f"site/sequences/{ONE}"):
         shutil.copytree(flow.results / place, other.results / place)
     other.artefact(ONE, "summary").unlink()

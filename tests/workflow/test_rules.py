@@ -72,9 +72,7 @@ def test_one_rule_has_the_inputs_of_all_stages() -> None:
     assert "unpack(inputs_of(_stage.name))" in RULES[""]
 
 
-@pytest.mark.parametrize(
-    "arguments", [("--lint",), ("--workflow-profile", "profiles/slurm", "--dry-run")]
-)
+@pytest.mark.parametrize("arguments", [("--lint",), ("--workflow-profile", "slurm", "--dry-run")])
 def test_snakemake_finds_no_fault_and_understands_the_profile(
     flow: Flow, arguments: tuple[str, ...]
 ) -> None:

@@ -54,7 +54,7 @@ NOTHING = "(?!)"  # pattern without a match
 RESULTS = PROJECT.results.as_posix()
 LOGS = PROJECT.logs.as_posix()
 BENCHMARKS = PROJECT.benchmarks.as_posix()
-ENVIRONMENT = "../../envs/intercap.yaml"
+ENVIRONMENT = "../envs/intercap.yaml"
 MODEL_THREADS = 8
 
 
