@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,9 +18,10 @@ from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import read_label_map
 from intercap_core.inputs.documents import read_yaml
-from intercap_core.inputs.files import UnreadableFile, printable, quoted, read_text
+from intercap_core.inputs.files import quoted
 from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
+from intercap_core.validation import describe, parse_entry, read_table
 
 M = TypeVar("M", bound=BaseModel)
 MAX_NAMES = 40  # names of a table that a message lists
@@ -130,7 +131,11 @@ class Project:
                     "annotation; correct the column or clear it"
                 )
             return Annotation()
-        annotation = _parse(Annotation, _or_empty(read_yaml(path)), str(path), "annotation")
+        faults: list[str] = []
+        values = _or_empty(read_yaml(path))
+        annotation = parse_entry(Annotation, values, str(path), "annotation", faults)
+        if annotation is None:
+            raise UserError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
         problem = annotation.check_object(self.sequences[sequence].object)
         if problem:
             raise UserError(
@@ -182,62 +187,96 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     """Read and check a settings file and all its tables.
 
     ``overrides`` are settings that replace those of the file, nested as in the file. Raises
-    UserError naming the file, row and field of the first mistake.
+    UserError with the first fault of :func:`read_project`.
+    """
+    project, faults = read_project(path, overrides)
+    if project is None or faults:
+        more = len(faults) - 1
+        hint = f" (and {more} more: intercap check {path} lists them)" if more else ""
+        raise UserError(faults[0] + hint)
+    return project
+
+
+def read_project(
+    path: Path, overrides: Mapping[str, Any] | None = None
+) -> tuple[Project | None, list[str]]:
+    """Read a settings file and all its tables; returns the valid part and all faults.
+
+    The faults name file, row and field. Those that others may follow from come first: settings,
+    people, objects, sequences, then missing files. The project has the valid entries of the
+    settings and the sequences whose row, subject and object are valid; None if there are none.
+    Raises UserError if the settings file cannot be read.
     """
     path = Path(path)
+    faults: list[str] = []
+    config = _read_config(path, overrides or {}, faults)
+    if config is None:
+        return None, faults
+    subjects_table = tidy(path.parent / config.subjects)
+    people = read_table(subjects_table, SubjectEntry, "subject", path, faults)
+    objects_file = tidy(path.parent / config.objects)
+    things = _read_objects(objects_file, path, faults)
+    table = tidy(path.parent / config.sequences)
+    rows = read_table(table, SequenceEntry, "sequence", path, faults)
+    listed: dict[str, tuple[Mapping[str, BaseModel | None], Path]] = {
+        "subject": (people, subjects_table), "object": (things, objects_file),
+    }  # fmt: skip
+    valid: dict[str, SequenceEntry] = {}
+    for name, row in rows.items():
+        if row is None:
+            continue
+        named = {field: getattr(row, field) for field in listed if getattr(row, field) is not None}
+        for field, value in named.items():
+            known, file = listed[field]
+            if value not in known:
+                faults.append(
+                    f"{table}: sequence {name!r} has {field} {value!r}, which is not in "
+                    f"the table of {field}s {file} ({_some(known) or 'empty'}); correct the "
+                    f"name or add the {field}"
+                )
+        if name not in config.exclude and all(
+            listed[field][0].get(value) is not None for field, value in named.items()
+        ):
+            valid[name] = _absolute(row, table.parent)
+    faults += [
+        f"{path}: exclude names {name!r}, which {table} does not list"
+        for name in sorted(set(config.exclude) - set(rows))
+    ]
+    if not set(rows) - set(config.exclude) and not any(str(table) in fault for fault in faults):
+        faults.append(f"{table}: holds no sequence (or all are excluded); add at least one row")
+    if config.device == "cuda":
+        faults.append(
+            f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
+        )
+    subjects = {name: row for name, row in people.items() if row is not None}
+    objects = {name: entry for name, entry in things.items() if entry is not None}
+    project = Project(config, path, valid, subjects, objects)
+    faults += [*_faults_of_files(project), *_faults_of_studio(project, rows, table)]
+    return (project if valid else None), faults
+
+
+def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) -> Config | None:
+    """The valid entries of a settings file, with absolute or working-directory-relative paths."""
     values = _or_empty(read_yaml(path))
     if not isinstance(values, dict):
         raise UserError(
             f"{path}: expected names and values, found {type(values).__name__}; "
             "config/README.md lists them"
         )
-    config = _parse(Config, _merged(values, overrides or {}), str(path), "setting")
-    subjects_table = tidy(path.parent / config.subjects)
-    subjects = {
-        row.subject: row for row in _read_table(subjects_table, SubjectEntry, "subject", path)
-    }
-    objects_file = tidy(path.parent / config.objects)
-    if not objects_file.exists():
-        raise UserError(
-            f"{objects_file}: there is no such file; check the path 'objects' in the settings, "
-            f"{path}"
-        )
-    objects = _read_objects(objects_file)
-    table = tidy(path.parent / config.sequences)
-    rows = {row.sequence: row for row in _read_table(table, SequenceEntry, "sequence", path)}
-    for row in rows.values():
-        for field, known, listed in (
-            ("subject", subjects, subjects_table),
-            ("object", objects, objects_file),
-        ):
-            value = getattr(row, field)
-            if value is not None and value not in known:
-                raise UserError(
-                    f"{table}: sequence {row.sequence!r} has {field} {value!r}, which is not in "
-                    f"the table of {field}s {listed} ({_some(known) or 'empty'}); correct the "
-                    f"name or add the {field}"
-                )
-    unknown = sorted(set(config.exclude) - set(rows))
-    if unknown:
-        raise UserError(f"{path}: exclude names {unknown[0]!r}, which {table} does not list")
-    sequences = {
-        name: _absolute(row, table.parent)
-        for name, row in rows.items()
-        if name not in config.exclude
-    }
-    if not sequences:
-        raise UserError(f"{table}: holds no sequence (or all are excluded); add at least one row")
+    values = _merged(values, overrides)
+    try:
+        config = Config.model_validate(values)
+    except ValidationError as error:
+        faults += describe(error, str(path), "setting")
+        wrong = {fault["loc"][0] for fault in error.errors() if fault["loc"]}
+        left = {key: value for key, value in values.items() if key not in wrong}
+        try:
+            config = Config.model_validate({"dataset": "unnamed", **left})
+        except ValidationError:
+            return None
     sections = {name: value for name, value in config if isinstance(value, BaseModel)}
     moved = {name: _absolute(value, path.parent) for name, value in sections.items()}
-    config = config.model_copy(update={**moved, "results": tidy(root_of(path) / config.results)})
-    if config.device == "cuda":
-        raise UserError(
-            f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
-        )
-    project = Project(config, path, sequences, subjects, objects)
-    _check_files(project)
-    _check_studio(project, rows, table)
-    return project
+    return config.model_copy(update={**moved, "results": tidy(root_of(path) / config.results)})
 
 
 def _some(names: Iterable[str]) -> str:
@@ -257,45 +296,45 @@ def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str
     return merged
 
 
-def _check_files(project: Project) -> None:
-    """Raise UserError if a mesh or body file is missing; sequences share these files."""
+def _faults_of_files(project: Project) -> Iterator[str]:
+    """Messages about missing meshes and body files, which sequences share."""
     for name in project.objects_named():
         entry = project.objects[name]
         for field in ("mesh", "contact_vertices"):
             file = getattr(entry, field)
             if file is not None and not file.is_file():
-                raise UserError(
+                yield (
                     f"{tidy(project.path.parent / project.config.objects)}: object {name!r} has "
                     f"{field} {file}, and there is no such file; correct the path"
                 )
         problem = project.config.joint.check_object(entry)
         if problem:
-            raise UserError(f"{tidy(project.path.parent / project.config.objects)}: {problem}")
+            yield f"{tidy(project.path.parent / project.config.objects)}: {problem}"
     for field, file in project.config.body_models:
         if isinstance(file, Path) and not file.is_file():
-            raise UserError(
+            yield (
                 f"{project.path}: body_models.{field} is {file}, and there is no such file; "
                 "correct the path, or remove the line to use the open model"
             )
     definition = project.config.body_fit.keypoint_definition
     if definition is not None and not definition.is_file():
-        raise UserError(
+        yield (
             f"{project.path}: body_fit.keypoint_definition is {definition}, and there is no such "
             "file; write it by 'intercap keypoint-definition', or remove the line"
         )
     for file in project.config.joint.lemo_files or ():
         if not file.is_file():
-            raise UserError(
+            yield (
                 f"{project.path}: joint.lemo is {project.config.joint.lemo}, and there is no file "
                 f"{file}; name the folder of LEMO's release, or remove the line to penalise the "
                 "joints' accelerations instead"
             )
-    _check_bodies(project)
-    _check_detectors(project)
+    yield from _faults_of_bodies(project)
+    yield from _faults_of_detectors(project)
 
 
-def _check_bodies(project: Project) -> None:
-    """Raise UserError if body files are named, but none for some subject.
+def _faults_of_bodies(project: Project) -> Iterator[str]:
+    """Messages if body files are named, but none for some subject.
 
     That subject would get the open body, whose mesh differs from the files'.
     """
@@ -306,34 +345,37 @@ def _check_bodies(project: Project) -> None:
     for name in sorted({row.subject for row in project.sequences.values()}):
         gender = project.subjects[name].gender
         if models.of(gender) is None:
-            raise UserError(
+            yield (
                 f"{project.path}: subject {name!r} is {gender}, and body_models names only a file "
                 f"for {' and '.join(named)}; add body_models.{gender} or body_models.neutral, or "
                 "remove the lines to use the open body for all"
             )
 
 
-def _check_detectors(project: Project) -> None:
-    """Raise UserError if a detector's model or file of class names is missing or unreadable."""
+def _faults_of_detectors(project: Project) -> Iterator[str]:
+    """Messages about a detector's model or file of class names that is missing or unreadable."""
     settings = project.config.detections
     models = ("segmentation_model", "keypoint_model")
     for field in (*models, "segmentation_labels", "category_names"):
         file = getattr(settings, field)
         if isinstance(file, Path) and not file.is_file():
-            raise UserError(
+            yield (
                 f"{project.path}: detections.{field} is {file}, and there is no such file; correct "
                 "the path"
             )
-        if isinstance(file, Path) and field not in models:
-            read_label_map(file)
+        elif isinstance(file, Path) and field not in models:
+            try:
+                read_label_map(file)
+            except UserError as error:
+                yield str(error)
 
 
-def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path) -> None:
-    """Raise UserError if a capture contradicts its row of the table of sequences."""
+def _faults_of_studio(project: Project, rows: Collection[str], table: Path) -> Iterator[str]:
+    """Messages about captures that contradict their row of the table of sequences."""
     captures = project.config.studio.captures if project.config.studio else {}
     for sequence in captures:
         if sequence not in rows:
-            raise UserError(
+            yield (
                 f"{project.path}: studio.captures names {sequence!r}, which {table} does not "
                 "list; add the row or remove the capture"
             )
@@ -343,12 +385,12 @@ def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path)
         given = project.sequences[sequence].recordings
         layouts = captures[sequence].layout, project.sequences[sequence].layout
         if layouts[0] != layouts[1]:
-            raise UserError(
+            yield (
                 f"{table}: sequence {sequence!r} has layout {layouts[1]!r}, but the studio writes "
                 f"{layouts[0]!r} (studio.captures in {project.path}); make them the same"
             )
         if made is not None and made.resolve() != given.resolve():
-            raise UserError(
+            yield (
                 f"{table}: sequence {sequence!r} has recordings {given}, but the studio writes "
                 f"them to {made}; correct the path"
             )
@@ -377,99 +419,36 @@ def _or_empty(values: Any) -> Any:
     return {} if values is None else values
 
 
-def _parse(model: type[M], values: Any, where: str, what: str) -> M:
-    """Validate values by a model; raises UserError with the first fault.
-
-    ``where`` is the place in the message, ``what`` the kind of entry, such as "setting".
-    """
-    if not isinstance(values, dict):
-        raise UserError(f"{where}: expected names and values, found {quoted(values)}; correct it")
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part)[:80] for part in first["loc"]) or "(the whole entry)"
-        message = first["msg"].removeprefix("Value error, ")[:400]
-        if first["type"] == "string_pattern_mismatch":
-            message = "a name has letters, digits, _ and - only, and does not start with -"
-        found = first.get("input")
-        shown = "" if isinstance(found, dict) else f", found {quoted(found)}"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        fault = printable(f"{what} {field}: {message}{shown}{more}")
-        raise UserError(f"{where}: {fault}; correct it") from None
-
-
-def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]:
-    """Read a tab-separated table with a header; ``key`` is the column with unique names.
-
-    Empty lines and lines that begin with # are skipped.
-    """
-    try:
-        lines = read_text(path).splitlines()
-    except UnreadableFile as error:
-        raise UserError(
-            f"{path}: not a readable text file ({error.reason}); check the path in the settings, "
-            f"{settings}"
-        ) from None
-    numbered = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.startswith("#")
-    ]
-    header = numbered[0][1].split("\t") if numbered else []
-    _check_header(path, numbered[0][0] if numbered else 1, header, model)
-    rows: list[M] = []
-    seen: dict[str, int] = {}
-    for number, line in numbered[1:]:
-        fields = line.split("\t")
-        record = dict(zip(header, fields, strict=False))
-        where = f"{path}, line {number} ({key} {quoted(record.get(key))})"
-        if len(fields) != len(header):
-            raise UserError(f"{where}: the number of columns differs from the header; use tabs")
-        row = _parse(model, {k: v for k, v in record.items() if v != ""}, where, "column")
-        name = getattr(row, key)
-        if name in seen:
-            raise UserError(f"{where}: line {seen[name]} has the same name; names must differ")
-        seen[name] = number
-        rows.append(row)
-    return rows
-
-
-def _check_header(path: Path, line: int, found: Sequence[str], model: type[BaseModel]) -> None:
-    """Raise UserError if a table's header lacks, repeats or does not know a column."""
-    fields = model.model_fields
-    required = [name for name, field in fields.items() if field.is_required()]
-    problems = [
-        *(f"column {name!r} is missing" for name in required if name not in found),
-        *(f"column {name!r} is given twice" for name in fields if found.count(name) > 1),
-        *(f"column {quoted(name)} is not known" for name in found if name not in fields),
-    ]
-    if problems:
-        optional = [name for name in fields if name not in required]
-        more = f" and, where wanted, {', '.join(optional)}" if optional else ""
-        raise UserError(
-            f"{path}, line {line}: {problems[0]}; the header has {', '.join(required)}{more}: "
-            "use tabs between them"
+def _read_objects(path: Path, settings: Path, faults: list[str]) -> dict[str, ObjectEntry | None]:
+    """Read the objects file: entries by name with resolved paths, None for faulty ones."""
+    if not path.exists():
+        faults.append(
+            f"{path}: there is no such file; check the path 'objects' in the settings, {settings}"
         )
-
-
-def _read_objects(path: Path) -> dict[str, ObjectEntry]:
-    """Read the objects file: entries by name, with resolved paths."""
-    values = _or_empty(read_yaml(path))
+        return {}
+    try:
+        values = _or_empty(read_yaml(path))
+    except UserError as error:
+        faults.append(str(error))
+        return {}
     if not isinstance(values, dict):
-        raise UserError(
+        faults.append(
             f"{path}: expected object names and entries, found {type(values).__name__}; correct it"
         )
-    objects = {}
+        return {}
+    objects: dict[str, ObjectEntry | None] = {}
     for name, entry in values.items():
         where = f"{path}, object {quoted(name)}"
         if not isinstance(entry, dict | None):
-            raise UserError(
+            faults.append(
                 f"{where}: expected fields such as 'mesh: cup.ply', found {quoted(entry)}; correct "
                 "it"
             )
-        parsed = _parse(ObjectEntry, {"name": name, **(entry or {})}, where, "field")
-        objects[name] = _absolute(parsed, path.parent)
+            objects[name] = None
+            continue
+        fields = {"name": name, **(entry or {})}
+        parsed = parse_entry(ObjectEntry, fields, where, "field", faults)
+        objects[name] = None if parsed is None else _absolute(parsed, path.parent)
     return objects
 
 

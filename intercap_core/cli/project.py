@@ -106,33 +106,28 @@ def tables(context: typer.Context, layout: str) -> None:
 def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     """Check settings, tables, annotations and recordings, and list every problem.
 
-    Opens each recording and compares its image size with the calibration, its length with its
-    header and the other cameras, and its images with the detections. Takes a fraction of a second
-    per sequence.
+    Problems that others may follow from come first; fix them in this order. Opens each recording
+    and compares its image size with the calibration, its length with its header and the other
+    cameras, and its images with the detections. Takes a fraction of a second per sequence.
 
     Example: intercap check config/demo/config.yaml
     """
-    from intercap_core.commands.check import check_bodies, check_detector, check_sequences
-    from intercap_core.project import load_project
+    from intercap_core.commands.check import check_project
 
-    project = load_project(settings)
-    check_bodies(project)
-    notes = check_detector(project)
     start = time.monotonic()
-    found = check_sequences(project)
-    elapsed, faults = time.monotonic() - start, found.faults
+    found = check_project(settings)
+    elapsed = time.monotonic() - start
     for summary in found.summaries:
         typer.echo(summary)
-    for note in [*notes, *found.notes]:
+    for note in found.notes:
         typer.echo(f"note: {note}")
-    for fault in faults:
+    for fault in found.faults:
         typer.echo(f"problem: {fault}", err=True)
     if found.summaries:
         count = len(found.summaries)
         typer.echo(f"checked the recordings of {count} sequences in {elapsed:.1f} s")
-    good = len(project.sequences) - len({fault.sequence for fault in faults} - {""})
-    typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
-    if faults:
+    typer.echo(f"{settings}: {found.ready} of {found.sequences} sequences are ready to run")
+    if found.faults:
         raise typer.Exit(1)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, field
 from logging.handlers import BufferingHandler
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
-from intercap_core.project import Project, tidy
+from intercap_core.project import Project, read_project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.commands.check_recordings import RecordingFindings
@@ -82,20 +84,64 @@ def check_detector(project: Project) -> list[Fault]:
 
 @dataclass
 class Findings:
-    """Findings on all sequences."""
+    """Findings on a project."""
 
     faults: list[Fault] = field(default_factory=list)
-    """Faults that would end a run of the sequence."""
+    """Faults that would end a run of the sequence or, without a sequence, of the project. Those
+    that others may follow from come first."""
     notes: list[Fault] = field(default_factory=list)
     """Probable mistakes that do not end a run."""
     summaries: list[Fault] = field(default_factory=list)
     """One line per usable recording."""
+    sequences: int = 0
+    """Number of the sequences whose rows are valid."""
+    ready: int = 0
+    """Number of the sequences that can run."""
 
     def add(self, sequence: str, found: RecordingFindings) -> None:
         """Add the findings on the recordings of a sequence."""
         self.faults += [Fault(sequence, message) for message in found.faults]
         self.notes += [Fault(sequence, message) for message in found.notes]
         self.summaries += [Fault(sequence, found.summary)] if found.summary else []
+
+
+def check_project(settings: Path) -> Findings:
+    """Check settings, tables, the files that they name, and all sequences, in one pass."""
+    project, faults = read_project(settings)
+    findings = Findings([Fault("", message) for message in faults])
+    if project is None:
+        return findings
+    findings.sequences = len(project.sequences)
+    if not faults:  # a missing model is a fault already
+        for check in (check_bodies, check_detector):
+            try:
+                findings.notes += check(project) or []
+            except UserError as error:
+                findings.faults.append(Fault("", str(error)))
+    findings.faults += [Fault("", message) for message in fault_of_results(project)]
+    found = check_sequences(project)
+    refused = bool(findings.faults)
+    findings.faults += sorted(found.faults, key=lambda fault: bool(fault.sequence))
+    findings.notes += found.notes
+    findings.summaries += found.summaries
+    faulty = {fault.sequence for fault in findings.faults} - {""}
+    findings.ready = 0 if refused else findings.sequences - len(faulty)
+    return findings
+
+
+def fault_of_results(project: Project) -> list[str]:
+    """Error message if files cannot be written to the folder of results; [] otherwise."""
+    place = next(path for path in (project.results, *project.results.absolute().parents)
+                 if path.exists())  # fmt: skip
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            return []
+    except OSError as error:
+        return [
+            f"{project.results}: the folder of results cannot be written ({place}: "
+            f"{error.strerror}); change its permissions, or name another folder in 'results' of "
+            f"{project.path}"
+        ]
 
 
 def check_sequences(project: Project) -> Findings:

@@ -63,6 +63,8 @@ class RecordingFindings:
     """Faults that cost a camera or most of its images."""
     notes: list[str] = field(default_factory=list)
     """Smaller losses and probable mistakes."""
+    depth: bool = False
+    """Whether any camera has depth that is used."""
     images: dict[str, CameraImages] = field(default_factory=dict, compare=False)
     """Images of each camera whose recording could be opened; their number may be estimated."""
     recognised: dict[str, set[str]] = field(default_factory=dict)
@@ -167,6 +169,7 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
         )
     findings.notes += _notes_on_keypoints(project, row, posed, findings)
     findings.notes += _notes_on_candidates(project, row, posed, findings)
+    findings.notes += _notes_on_object(project, row, posed, findings)
     if findings.summary:
         recognised = [
             f"{kind}: {', '.join(sorted(texts))}"
@@ -256,6 +259,25 @@ def _notes_on_candidates(
     return notes
 
 
+def _notes_on_object(
+    project: Project, row: SequenceEntry, cameras: list[str], findings: RecordingFindings
+) -> list[str]:
+    """Note that neither depth nor candidates show the object, [] if one of them does."""
+    has_model = project.config.detections.segmentation_model is not None
+    folder = row.candidates
+    if row.object is None or has_model or findings.depth or row.layout == "behave":
+        return []
+    if folder is not None and any(
+        candidate_files.has_candidates(folder, name, row.layout) for name in cameras
+    ):
+        return []
+    return [
+        f"no camera has depth and there are no candidates of object {row.object!r}, so it will "
+        "probably not be found; run a segmentation model and add the column candidates, or record "
+        "with depth"
+    ]
+
+
 def list_labels(labels: list[str]) -> str:
     """The first labels of a detector as text."""
     more = f" and {len(labels) - 8} more" if len(labels) > 8 else ""
@@ -331,6 +353,7 @@ def check_recordings(
             "their optical axes meet, so their poses likely have OpenGL's axes (y up, z "
             "backwards); expected y down, z forward"
         )
+    findings.depth = any(recording.depth for recording in recordings.values())
     if len(cameras) == len(recordings) == 1 and not recordings[cameras[0]].depth:
         findings.faults.append(
             f"{row.recordings}: only camera {cameras[0]} is used, and without depth; "

@@ -29,7 +29,7 @@ from intercap_core.commands.console import ListTable
 from intercap_core.commands.run import Watcher
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
-from intercap_core.project import load_project
+from intercap_core.project import load_project, root_of
 from intercap_core.schemas import DETECTIONS
 from intercap_core.stage_list import STAGES
 from tests.helpers.kinect_files import record
@@ -201,6 +201,51 @@ def test_check_lists_all_faults_of_all_sequences(small_project: Path) -> None:
     assert len(problems) == 4
     assert sum("'bad'" in line for line in problems) == 3
     assert "'empty'" in problems[-1]
+
+
+def test_check_lists_the_faults_of_all_files_in_one_pass(small_project: Path) -> None:
+    """Settings, people, objects and sequences come first, in this order; then the recordings."""
+    (small_project / "config.yaml").write_text(
+        "dataset: trial\njoint: {contact_weight: -1}\nscene: {floor: 1}\n"
+    )
+    (small_project / "subjects.tsv").write_text("subject\tgender\ns01\tmale\ns02\tM\n")
+    (small_project / "objects.yaml").write_text("cup: {mesh: cup.ply}\nmug: {}\n")
+    with (small_project / "sequences.tsv").open("a") as table:
+        table.write("two\ts02\tcup\trec\trig.json\nthree\ts09\tmug\trec\trig.json\nbad\ts01\n")
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert done.returncode == 1 and "0 of 3 sequences are ready" in done.stdout
+    expected = [
+        ("config.yaml", "scene.floor"), ("config.yaml", "joint.contact_weight"),
+        ("subjects.tsv, line 3", "gender"), ("objects.yaml, object 'mug'", "mesh"),
+        ("sequences.tsv, line 7", "number of columns"), ("'three'", "subject 's09'"),
+        ("sequence 'bad'", "annotations/bad.yaml"),
+    ]  # fmt: skip
+    lines = done.stderr.splitlines()
+    for line, parts in zip(lines, expected, strict=False):
+        assert line.startswith("problem: ") and all(part in line for part in parts), line
+    assert len(lines) == len(expected) + 3  # the other faults of the recordings
+
+
+def test_paths_do_not_depend_on_the_working_directory(
+    small_project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(small_project.parent)
+    project = load_project(Path(small_project.name) / "config.yaml")
+    assert project.results == Path(small_project.name) / "results" / "trial"
+    assert project.logs == Path(small_project.name) / "logs" / "trial"
+    assert project.target(project.results) == "results/trial"
+    (small_project / "config").mkdir()
+    for name in ("config.yaml", "subjects.tsv", "objects.yaml", "sequences.tsv"):
+        (small_project / name).rename(small_project / "config" / name)
+    assert root_of(small_project / "config" / "config.yaml") == Path(small_project.name)
+    assert root_of(small_project / "config" / "lab" / "config.yaml") == Path(small_project.name)
+
+
+def test_check_reports_results_that_cannot_be_written(small_project: Path) -> None:
+    (small_project / "results").write_text("a file")
+    done = intercap("check", "config.yaml", folder=small_project)
+    assert done.stderr.startswith("problem: results/trial: the folder of results cannot be written")
+    assert "0 of 3 sequences are ready" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -382,8 +427,10 @@ def test_an_invalid_body_file_stops_before_any_job(
     config.write_text(config.read_text() + f"body_models: {{{model}: body.npz}}\n")
     done = intercap(command, "config.yaml", folder=small_project)
     assert done.returncode == 1
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
-    assert " file body.npz " in done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == (5 if command == "check" else 1)  # check goes on with the recordings
+    assert lines[0].startswith("problem: " if command == "check" else "error: ")
+    assert " file body.npz " in lines[0]
 
 
 def test_fits_on_a_gpu_are_refused(inside: Path) -> None:

@@ -82,6 +82,13 @@ def test_what_cannot_be_seen_is_marked_and_has_a_default(folder: Path) -> None:
     assert output.count("FILL IN") == 2
 
 
+def test_an_object_that_nothing_shows_is_noted(folder: Path) -> None:
+    assert "will probably not be found" not in init()[0]
+    shutil.rmtree(folder / "candidates")
+    output, _ = init("--replace")
+    assert "no camera has depth and there are no candidates of object 'cup'" in output
+
+
 def test_a_missing_calibration_is_marked(folder: Path) -> None:
     (folder / "rig.json").unlink()
     done = CliRunner().invoke(app, ["init", "captures", "--output", "lab"])
