@@ -27,6 +27,7 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.lease import Lease, find_snakemake, lease_path, try_acquire
 from intercap_core.pipeline.plan import Plan
+from intercap_core.pipeline.stage_inputs import DATASET_READS
 from intercap_core.project import Project, load_project
 from intercap_core.shipped import shipped
 from intercap_core.signals import Terminated
@@ -166,7 +167,7 @@ def _run(
     bad = sorted(
         name
         for name in {name.split(":")[0] for name in failures} & set(project.sequences)
-        if not project.artefact(name, "summary").is_file()
+        if not all(project.artefact(name, stage).exists() for stage in DATASET_READS)
     )
     if bad and len(bad) < len(project.sequences) and not arguments:
         console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)

@@ -45,6 +45,7 @@ WHOLE = "*"  # stands for every name of a module
 MODULES = {
     **{stage: f"stages.{stage}" for stage in STAGES},
     "dataset": "stages.dataset",
+    "merged exports": "output.export.merged",
     "studio": "studio.capture",
 }
 
@@ -56,12 +57,12 @@ class StageCode:
     digests: Mapping[str, str]
     """Digest of the modules that it reaches, by package."""
     parameters: tuple[str, ...]
-    """Names of the arguments of its ``run``; () for the dataset and the studio."""
+    """Names of the arguments of its ``run``; () for others than stages."""
 
 
 @cache
 def stage_code(name: str) -> StageCode:
-    """The code of a stage, of "dataset" or of "studio"."""
+    """The code of a stage or of another name of ``MODULES``."""
     return _all_stage_code()[name]
 
 

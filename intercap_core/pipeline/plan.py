@@ -28,6 +28,7 @@ from intercap_core.pipeline.job import last_failure
 from intercap_core.pipeline.lease import file_system_time
 from intercap_core.pipeline.provenance import DATASET_OUTPUTS, FILE, Manifest, read_manifest
 from intercap_core.pipeline.stage_inputs import (
+    DATASET_READS,
     STUDIO,
     dataset_manifest,
     stage_manifest,
@@ -84,10 +85,14 @@ class Plan:
 
     @cached_property
     def dataset(self) -> OutputState:
-        """State of the outputs of all sequences: tables, card and the site's first page."""
+        """State of the outputs of all sequences: tables, card, merged exports and first page."""
+        names = self.project.sequences
         current = dataset_manifest(
             self.project,
-            {name: self.states(name)["summary"].fingerprint for name in self.project.sequences},
+            {
+                stage: {name: self.states(name)[stage].fingerprint for name in names}
+                for stage in DATASET_READS
+            },
             failures(self.project),
         )
         files = [self.project.results / name for name in DATASET_OUTPUTS]

@@ -28,7 +28,7 @@ FILE = ".made_from.json"  # manifest of a folder, inside it
 FORMAT = 1
 DATASET_OUTPUTS = (
     "site/index.html", "summary.json", "heatmaps.h5", "tables", "card.md", "card.json",
-    "croissant.json",
+    "croissant.json", "export",
 )  # fmt: skip
 _PAGES = "sequences"  # folder of the sequences' pages in the site
 _NOT_COMPARED = ("machine", "outputs")

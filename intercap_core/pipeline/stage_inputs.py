@@ -31,6 +31,7 @@ from intercap_core.stage_list import STAGES
 from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
+DATASET_READS = ("summary", "export")  # stages whose outputs those of all sequences are made from
 
 
 def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
@@ -132,12 +133,12 @@ def studio_manifest(project: Project, sequence: str, checksums: InputChecksums) 
 
 
 def dataset_manifest(
-    project: Project, summaries: Mapping[str, str], failed: Mapping[str, str]
+    project: Project, made: Mapping[str, Mapping[str, str]], failed: Mapping[str, str]
 ) -> Manifest:
-    """Manifest of the outputs of all sequences: tables, card and the site's first page.
+    """Manifest of the outputs of all sequences: tables, card, merged exports and first page.
 
     Args:
-        summaries: fingerprint of each sequence's summary.
+        made: fingerprint by stage and sequence of the outputs of ``DATASET_READS``.
         failed: reason by excluded sequence.
     """
     given = {
@@ -150,8 +151,17 @@ def dataset_manifest(
         "failed": dict(failed),
         "changed": changed(project.config),
     }
-    code = stage_code("dataset").digests
-    return Manifest("dataset", "", to_plain(given), {}, dict(summaries), code, library_versions())
+    read = {
+        f"{stage} of {name}": fingerprint
+        for stage, of in made.items()
+        for name, fingerprint in of.items()
+    }
+    merged = stage_code("merged exports").digests
+    code = {
+        **stage_code("dataset").digests,
+        **{f"merged exports, {package}": digest for package, digest in merged.items()},
+    }
+    return Manifest("dataset", "", to_plain(given), {}, read, code, library_versions())
 
 
 def _manifest(

@@ -240,28 +240,26 @@ def run_dataset(project: Project) -> Path:
     The page names sequences that the project excludes because they failed, and those whose summary
     is missing or broken. Raises UserError if no sequence is left.
     """
+    from intercap_core.output.export import merged
     from intercap_core.output.site.settings import changed
     from intercap_core.stages import dataset
 
     folder = project.results
     failed = failures(project)
-    manifests = {
-        name: read_manifest(project.artefact(name, "summary")) for name in project.sequences
+    read = {
+        stage: {name: project.artefact(name, stage) for name in project.sequences}
+        for stage in stage_inputs.DATASET_READS
     }
-    current = stage_inputs.dataset_manifest(
-        project,
-        {
-            name: manifest.fingerprint
-            for name, manifest in manifests.items()
-            if manifest is not None
-        },
-        failed,
-    )
+    made = {
+        stage: {name: m.fingerprint for name, path in of.items() if (m := read_manifest(path))}
+        for stage, of in read.items()
+    }
+    current = stage_inputs.dataset_manifest(project, made, failed)
     with explain_disk_errors(project, folder / DATASET), acquire(folder / DATASET):
         (folder / FILE).unlink(missing_ok=True)
         first = dataset.run(
             dataset=project.config.dataset,
-            summaries={name: project.artefact(name, "summary") for name in project.sequences},
+            summaries=read["summary"],
             objects=project.objects,
             body_models=project.config.body_models,
             results=folder,
@@ -271,6 +269,8 @@ def run_dataset(project: Project) -> Path:
             failed=failed,
             changed=changed(project.config),
         )
+        exports = {name: path for name, path in read["export"].items() if path.is_dir()}
+        merged.write(folder / "export", project.config.dataset, exports, project.objects)
         write_manifest(folder, current)
         remember_output(folder)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))

@@ -10,14 +10,19 @@ from pathlib import Path
 
 from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums
 from intercap_core.pipeline.provenance import read_manifest, write_manifest
-from intercap_core.pipeline.stage_inputs import dataset_manifest, stage_manifest, studio_manifest
+from intercap_core.pipeline.stage_inputs import (
+    DATASET_READS,
+    dataset_manifest,
+    stage_manifest,
+    studio_manifest,
+)
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
 
 def rewrite_manifests(project: Project) -> None:
     """Make all existing outputs up to date."""
-    summaries = {}
+    read: dict[str, dict[str, str]] = {stage: {} for stage in DATASET_READS}
     for name in project.sequences:
         checksums = InputChecksums(project.results / name / INPUTS_FILE)
         fingerprints: dict[str, str] = {}
@@ -34,8 +39,9 @@ def rewrite_manifests(project: Project) -> None:
             output = project.artefact(name, stage)
             if output.exists() and read_manifest(output) != manifest:
                 write_manifest(output, manifest)
-        summaries[name] = fingerprints["summary"]
-    write_manifest(project.results, dataset_manifest(project, summaries, {}))
+        for stage, of in read.items():
+            of[name] = fingerprints[stage]
+    write_manifest(project.results, dataset_manifest(project, read, {}))
 
 
 if __name__ == "__main__":

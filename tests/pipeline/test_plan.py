@@ -262,6 +262,7 @@ def test_companion_files_of_a_mesh_count(folder: Path) -> None:
         ("summary.json", DATASET),
         ("heatmaps.h5", DATASET),
         ("tables/frames.csv", DATASET),
+        ("export/coco/annotations.json", DATASET),
         (f"{ONE}/export/amass/body.npz", _of(ONE, "export")),
         (f"site/sequences/{ONE}/viewer/data.bin", _of(ONE, "page")),
         (f"recordings/{OTHER}/k1.mkv", _of(OTHER, "studio", *STAGES) | DATASET),

@@ -10,7 +10,7 @@ from intercap_core.inputs.documents import read_yaml
 from intercap_core.pipeline.code_digest import stage_code
 from intercap_core.pipeline.lease import remove_dead_lock
 from intercap_core.pipeline.plan import DATASET, Plan
-from intercap_core.pipeline.stage_inputs import files_read
+from intercap_core.pipeline.stage_inputs import DATASET_READS, files_read
 from intercap_core.pipeline.resources import (
     extent_of,
     has_model,
@@ -148,10 +148,15 @@ def output_of(stage):
     return directory(path) if STAGES[stage].writes_folder else path
 
 
-def summaries(wildcards):
-    """Input function: the summaries of all sequences; dates count as in ``inputs_of``."""
-    paths = expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES)
-    return paths if PLAN.is_stale("", DATASET) else ancient(paths)
+def read_by_dataset(wildcards):
+    """Input function: summaries and exports of all sequences; dates count as in ``inputs_of``."""
+    paths = {
+        stage: [PROJECT.artefact(name, stage).as_posix() for name in SEQUENCES]
+        for stage in DATASET_READS
+    }
+    if PLAN.is_stale("", DATASET):
+        return paths
+    return {stage: ancient(files) for stage, files in paths.items()}
 
 
 def length_of(wildcards):

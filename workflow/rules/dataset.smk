@@ -1,7 +1,7 @@
 rule dataset:
-    """Heatmaps, histograms, tables, the dataset's card and the site's first page."""
+    """Heatmaps, tables, card, merged exports and the site's first page."""
     input:
-        summaries=summaries,
+        unpack(read_by_dataset),
         mark=out_of_date("dataset"),
     output:
         site=report(f"{RESULTS}/site/index.html", category="Dataset"),
@@ -11,6 +11,7 @@ rule dataset:
         card=f"{RESULTS}/card.md",
         card_json=f"{RESULTS}/card.json",
         croissant=f"{RESULTS}/croissant.json",
+        export=directory(f"{RESULTS}/export"),
     log:
         f"{LOGS}/dataset.log",
     benchmark:

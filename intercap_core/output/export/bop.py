@@ -19,6 +19,7 @@ from intercap_core.output.export.meshes import ply
 from intercap_core.output.export.motion import Coordinates
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
+SCENES = "scenes"  # folder of the scenes
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
 
 
@@ -44,7 +45,7 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
     lenses: dict[str, Any] = {}
     targets = []
     for number, camera in enumerate(scenes.rig):
-        scene = folder / "scenes" / f"{number:06d}"
+        scene = folder / SCENES / f"{number:06d}"
         scene.mkdir(parents=True)
         poses = scenes.poses[number]
         _dump(scene / "scene_camera.json", scene_camera(camera, list(poses)))

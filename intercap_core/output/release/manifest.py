@@ -57,7 +57,7 @@ def kind_of(path: PurePosixPath) -> str | None:
         return None
     if len(path.parts) == 1:
         return None if path.name in (MANIFEST, SUMS) else "card"
-    if path.parts[0] in ("tables", "site"):
+    if path.parts[0] in ("tables", "site", "export"):
         return path.parts[0]
     return "export" if path.parts[1] == "export" else "artefact"
 
@@ -152,7 +152,8 @@ def _sequence_of(path: PurePosixPath, kind: str) -> str | None:
     """Return the sequence of a file; None for files of the whole dataset."""
     if kind == "site":
         return path.parts[2] if path.parts[1] == "sequences" else None
-    return path.parts[0] if kind in ("export", "artefact") else None
+    of_all = path.parts[0] == "export" or kind not in ("export", "artefact")
+    return None if of_all else path.parts[0]
 
 
 def _digest(path: Path) -> tuple[str, int]:
