@@ -17,8 +17,8 @@ TABLES = ("compare_sequences.csv", "compare_frames.csv", "compare_figures.csv")
 # Heading, column of the table of sequences, and digits
 _COLUMNS = (
     ("frames", "frames", 0), ("changed", "changed_frames", 0), ("body mm", "body_mm", 1),
-    ("most", "body_max_mm", 1), ("hands mm", "hands_mm", 1), ("object mm", "object_mm", 1),
-    ("most", "object_max_mm", 1), ("object deg", "object_deg", 1),
+    ("body max mm", "body_max_mm", 1), ("hands mm", "hands_mm", 1), ("object mm", "object_mm", 1),
+    ("object max mm", "object_max_mm", 1), ("object deg", "object_deg", 1),
     ("contact differs", "contact_changed_frames", 0),
 )  # fmt: skip
 
@@ -81,8 +81,9 @@ def _figures(comparison: Comparison) -> Table:
 
 
 def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+    return f"{value:.{digits}f}" if np.isfinite(value) else ""
 
 
 def _pair(before: float, after: float, digits: int) -> str:
-    return f"{_number(before, digits)} → {_number(after, digits)}"
+    words = (_number(before, digits), _number(after, digits))
+    return " → ".join(text or "–" for text in words) if any(words) else ""

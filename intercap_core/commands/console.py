@@ -49,7 +49,11 @@ class ListTable(Table):
 
     def _paragraphs(self, console: Console) -> Iterator[Text | Padding]:
         def text(cell: object) -> Text:
-            return console.render_str(cell) if isinstance(cell, str) else Text(str(cell))
+            return (
+                console.render_str(cell, highlight=False)
+                if isinstance(cell, str)
+                else Text(str(cell))
+            )
 
         heads = [text(column.header) for column in self.columns[1:]]
         if self.title:
@@ -61,4 +65,4 @@ class ListTable(Table):
                 for head, cell in zip(heads, cells, strict=True)
                 if cell != ""
             ]
-            yield Padding(Text(", ").join(pairs), (0, 0, 0, 2))
+            yield Padding(Text("; ").join(pairs), (0, 0, 0, 2))
