@@ -365,7 +365,7 @@ def test_digest_follows_content_alone() -> None:
     assert digest(a.joint) != digest(Config(dataset="x").joint)
 
 
-@pytest.mark.parametrize("name", ["demo", "evaluation", "bench", "test", ""])
+@pytest.mark.parametrize("name", ["demo", "quickstart", "evaluation", "bench", "test", ""])
 def test_the_committed_settings_are_valid(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     project = load_project(Path("config") / name / "config.yaml")

@@ -118,7 +118,7 @@ def settings_page() -> str:
         "",
         "| folder | contents |",
         "|---|---|",
-        "| `demo/` | settings of `make demo` |",
+        "| `demo/`, `quickstart/` | virtual recordings of `make demo` and of docs/quickstart.md |",
         "| `evaluation/`, `capture/`, `object/`, `body/`, `field/`, `annotate/` "
         "| settings of `make evaluate` |",
         "| `bench/` | settings of `make bench` |",
