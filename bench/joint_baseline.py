@@ -16,7 +16,7 @@ Terms, with all frames and views in one batch:
 - Body in object, E_G, E_G', E_S and E_A are our equations with our weights. E_S is that of joints,
   because LEMO's weights are not free.
 
-Stick, planted feet, drift and time offsets go beyond the paper and are left out. Correspondences of
+Stick, planted feet and drift go beyond the paper and are left out. Correspondences of
 the clouds, pixel sigmas and standing vertices are updated every ``ROUND`` steps.
 """
 

@@ -32,14 +32,18 @@ class Flags:
     """(T,) reasons in words, joined by "; "; "" = no part is flagged."""
 
     @classmethod
-    def of(cls, frames: int, causes: Sequence[Cause]) -> Flags:
-        """Flags of T = ``frames`` frames from their causes, in this order."""
+    def of(cls, frames: int, causes: Sequence[Cause], *, has_object: bool = True) -> Flags:
+        """Flags of T = ``frames`` frames from their causes, in this order.
+
+        Without an object, object and contact are never flagged.
+        """
         flagged = np.zeros((frames, len(PARTS)), bool)
         reasons: list[dict[str, None]] = [{} for _ in range(frames)]
         for mask, reason, parts in causes:
             flagged[np.ix_(mask, np.isin(PARTS, parts))] = True
             for frame in np.flatnonzero(mask):
                 reasons[frame][reason] = None
+        flagged[:, np.isin(PARTS, OF_OBJECT)] &= has_object
         return cls(flagged, ["; ".join(texts) for texts in reasons])
 
     @classmethod

@@ -360,8 +360,12 @@ JOINT = Schema(
         "contact_annotated": Field(
             ("T", "R"), "int8", "annotation: 1 contact, 0 no contact, -1 not annotated"
         ),
-        "time_offset": Field(("C",), "float64", "that of the scene", "s"),
-        "time_offset_sigma": Field(("C",), "float64", "that of the scene", "s"),
+        "time_offset": Field(
+            ("C",), "float64", "exposure time minus the set's time, as in scene.h5", "s"
+        ),
+        "time_offset_sigma": Field(
+            ("C",), "float64", "standard deviation of time_offset; NaN = not estimated", "s"
+        ),
         "camera_names": Field(("C",), "str", "camera names"),
         "master_from_colour": Field(
             ("C", "4", "4"),

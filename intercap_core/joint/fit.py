@@ -291,4 +291,5 @@ def _flags(
         (against_images, CONTRADICTED, OF_OBJECT),
         (every & bool(against_floor), against_floor, PARTS),
     ]
-    return Flags.of(len(state), causes)
+    has_object = inputs.geometry.has_object or bool(flags.lost.any())
+    return Flags.of(len(state), causes, has_object=has_object)

@@ -28,7 +28,7 @@ HELD_RAD_S = 1.0  # the same of turns, rad/s; tuned
 FREE_COST_S = 30.0  # of free motion, nats/s: rest and hands explain most recordings; tuned
 MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second; tuned
 JUMP_COST = 10.0  # of a step that no motion explains, nats; tuned
-# Of going out of sight or coming into sight, and in addition of leaving the room or coming back.
+# Cost of a change between visible and hidden, and of a change between hidden and out of the room.
 VANISH_COST = 7.0  # nats; tuned
 
 HIDDEN = -1  # index in paths: no hypothesis is true

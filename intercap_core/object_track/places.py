@@ -15,7 +15,7 @@ import numpy as np
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.groups import find_groups, locate_group
-from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
+from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO
 from intercap_core.object_track.view import View
 
 # A place that is occupied in less than this share of the surveyed frames belongs to a moving
@@ -172,7 +172,7 @@ class Places:
         """
         nearest = self._nearest(place)
         apart = nearest is not None and np.linalg.norm(nearest[0].place - object_at) >= self._same
-        if nearest is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
+        if nearest is not None and apart and ratio > DECISIVE_LOG_RATIO:
             nearest[0].rival_frames.add(t)
         clutter = self._clutter_at(place) or (place, {})
         if np.linalg.norm(clutter[0] - object_at) < self._same:

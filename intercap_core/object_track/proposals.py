@@ -16,7 +16,7 @@ from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses, Prior
-from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
+from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import (
@@ -64,7 +64,7 @@ class Proposals:
             if fits:
                 best = float(self._prior.weigh(t, fits).max())
                 results.append((best, t, fits))
-                if best > SEARCH_GOOD_LOG_RATIO:
+                if best > DECISIVE_LOG_RATIO:
                     break
         if not results:
             raise NotFound
@@ -88,7 +88,7 @@ class Proposals:
             prior = MotionPrior(pose, given.sigma_m, given.sigma_rad)
             own = self._observer.fit(t, pose, prior, FIT_ROUNDS)
             # occlusion reaches -6 nats; -25 needs two or three views that see past the object
-            if own.log_ratio > -SEARCH_GOOD_LOG_RATIO:
+            if own.log_ratio > -DECISIVE_LOG_RATIO:
                 fits.append(own)
         if not fits:
             return False
@@ -209,10 +209,10 @@ class Proposals:
         poses = [fit.pose for fit in assessed]
         for k in distinct_poses(mesh, poses, (UNSURE_M, UNSURE_RAD), count=3):
             fits.append(self._fit(t, assessed[k].pose, assessed[k].twist))
-            if fits[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
+            if fits[-1].log_ratio > DECISIVE_LOG_RATIO:
                 break
         best = max(fits, key=lambda fit: fit.log_ratio)
-        if best.log_ratio < SEARCH_GOOD_LOG_RATIO:
+        if best.log_ratio < DECISIVE_LOG_RATIO:
             # no turn, and 35 degrees about each axis either way
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * np.radians(35)
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
@@ -233,7 +233,7 @@ class Proposals:
         for u in range(max(t - self._reach, 0), min(t + self._reach + 1, len(fits))):
             if u in sure:
                 poses[u] = sure[u]
-            elif u != t and self._hypotheses.best(u) > SEARCH_GOOD_LOG_RATIO:
+            elif u != t and self._hypotheses.best(u) > DECISIVE_LOG_RATIO:
                 poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
         before = [u for u in poses if u < t][:-3:-1]  # the last two, the nearest first
         after = [u for u in poses if u > t][:2]

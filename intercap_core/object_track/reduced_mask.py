@@ -1,4 +1,4 @@
-"""Masks decoded onto every n-th pixel, in the smallest window that contains them.
+"""Masks decoded onto every n-th pixel, in the window of the whole mask.
 
 The tracker compares silhouettes of about a hundred pixels. Decoding a full 1080p mask for each
 candidate of each view would cost more than the fit.

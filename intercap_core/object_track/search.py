@@ -31,7 +31,7 @@ from intercap_core.object_track.groups import (
     locate_group,
     outline_residuals,
 )
-from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
+from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.turns import axis_turns, distinct_poses, rotation_grid
 from intercap_core.object_track.view import FitContext, View
@@ -70,7 +70,7 @@ def search_pose(
         for start in starts:
             best = max([best, *(fit.log_ratio for fit in fits)])
             # a fit gains up to 15 nats, measured on the studio (bottle to chair)
-            if start.log_ratio > best - SEARCH_GOOD_LOG_RATIO:
+            if start.log_ratio > best - DECISIVE_LOG_RATIO:
                 fits.append(fit_pose(fit_context, views, start.pose, twist=start.twist))
         return fits
 
@@ -92,7 +92,7 @@ def search_pose(
         of_group = fit_starts(compare(poses)[:number_fitted])
         fits += of_group
         trusted = place_prior is None or place_prior(locate_group(group)) > 0.5
-        if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in of_group):
+        if trusted and any(fit.log_ratio > DECISIVE_LOG_RATIO for fit in of_group):
             break
     fits.sort(key=lambda fit: -fit.log_ratio)
     if fits and everywhere and not mesh.symmetry.sphere:

@@ -21,7 +21,7 @@ from intercap_core.object_track.evidence import UNKNOWN_SIGMA, FrameEvidence, st
 ACCELERATION_M_S2 = 6.0  # m/s^2; tuned on the studio
 ACCELERATION_RAD_S2 = 20.0  # rad/s^2; tuned on the studio
 # Standard deviations at which evidence of a frame, or an acceleration (an impact), is an outlier.
-OUTLIER_SIGMAS = 5.0  # tuned
+INNOVATION_SIGMAS = 5.0  # tuned
 
 
 def smooth(
@@ -58,7 +58,7 @@ def smooth(
         offset = step_between(evidence.poses, state[node])
         # squared distance of the node from the frame's own minimum, in standard deviations
         distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
-        weight = share * geman_mcclure_weight(distance, OUTLIER_SIGMAS)
+        weight = share * geman_mcclure_weight(distance, INNOVATION_SIGMAS)
         # an acceleration couples a node with itself and at most two nodes before it
         bands = np.zeros((3, count, 6, 6))
         gradient = np.zeros((count, 6))
@@ -126,12 +126,12 @@ def _remove_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
         kick = change[part]
         size = np.linalg.norm(kick, axis=1)
         back = -(kick[1:-1] * (kick[:-2] + kick[2:])).sum(1) > 0.5 * size[1:-1] ** 2
-        for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * OUTLIER_SIGMAS * limit)):
+        for t in 2 + np.flatnonzero(back & (size[1:-1] > 2 * INNOVATION_SIGMAS * limit)):
             past = step_between(poses[t - 1], poses[t + 1])
             ends = np.diff([rate[t - 2], past / (times[t + 1] - times[t - 1]), rate[t + 1]], axis=0)
             ends = 2 * ends / (times[[t, t + 2]] - times[[t - 2, t]])[:, None]
             # without a wrong frame the motion is smooth; between two places it never is
-            if (np.linalg.norm(ends[part], axis=1) < OUTLIER_SIGMAS * limit).all():
+            if (np.linalg.norm(ends[part], axis=1) < INNOVATION_SIGMAS * limit).all():
                 share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
                 result[t] = apply_step(poses[t - 1], share * past)
     return result
@@ -173,7 +173,7 @@ def _add_motion(
     weight = np.ones_like(residual)
     for part in (np.s_[:, :3], np.s_[:, 3:]):
         size = (residual[part] ** 2).sum(1, keepdims=True)
-        weight[part] = 1 / (1 + size / OUTLIER_SIGMAS**2)  # Cauchy's
+        weight[part] = 1 / (1 + size / INNOVATION_SIGMAS**2)  # Cauchy's
     for i, row in enumerate((a, b, c)):
         weighted = parts[i].transpose(0, 2, 1) * weight[:, None]
         np.add.at(gradient, row, np.einsum("tij,tj->ti", weighted, residual))

@@ -41,7 +41,7 @@ from intercap_core.object_track.given_poses import (
 )
 from intercap_core.object_track.likelihood import (
     CONTRADICTED_LOG_RATIO,
-    SEARCH_GOOD_LOG_RATIO,
+    DECISIVE_LOG_RATIO,
     SEEN_LOG_RATIO,
 )
 from intercap_core.object_track.observer import Observer
@@ -232,7 +232,7 @@ class WholeTrack:
         carried = smoothed.carried & unseen
         # a decided pose that lost 10 nats by smoothing fitted its frame only by chance
         contradicted = (unseen & (ratio < decided - 10)) | (ratio < CONTRADICTED_LOG_RATIO)
-        contradicted &= ~carried | (ratio < -SEARCH_GOOD_LOG_RATIO)
+        contradicted &= ~carried | (ratio < -DECISIVE_LOG_RATIO)
         seen = ~contradicted & (~unseen | ~smoothed.lost)
         bridged = smoothed.in_hand | self._between_equal_poses(poses, ~seen)
         nothing = np.where(gone, FrameStatus.GONE, FrameStatus.LOST)

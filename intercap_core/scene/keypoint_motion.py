@@ -26,10 +26,10 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 
 MAX_PATH_GAP_S = 0.35  # a path bridges at most this time without samples; tuned on the studio
 MIN_CONFIDENCE = 0.3  # keypoints of lower confidence are ignored; tuned on the studio
-OUTLIER_SIGMA = 4.0  # length of an outlier's residual, standard deviations; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +281,7 @@ def build_motion(
         residual = raw - bias
         size = np.linalg.norm(residual, axis=-1)
         sigma = np.maximum(_scatter(size, known), scale)  # a pixel at 1080p at least; tuned
-        valid = known & (np.nan_to_num(size, nan=np.inf) < OUTLIER_SIGMA * sigma)
+        valid = known & (np.nan_to_num(size, nan=np.inf) < OUTLIER_SIGMAS * sigma)
         points = _refitted(smooth, residual, by_point, valid, sigma)
     paths = smooth_paths(times, points)
     return _seeing(pixels, seen, rig, paths, sigma, bias)
@@ -306,7 +306,7 @@ def _seeing(
     expected = _pixels_of(paths.points, rig)
     seen = seen & np.isfinite(expected[..., 0])
     residual = np.where(seen[..., None], pixels - expected - bias, 0.0)
-    valid = seen & (np.linalg.norm(residual, axis=-1) < OUTLIER_SIGMA * sigma)
+    valid = seen & (np.linalg.norm(residual, axis=-1) < OUTLIER_SIGMAS * sigma)
     return KeypointMotion(rig, paths.times, paths, residual, seen, valid, sigma, bias)
 
 

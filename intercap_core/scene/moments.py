@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.synchronise import frame_interval, images_of_moments
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 from intercap_core.scene.keypoint_timing import TimeOffsets, find_offsets
 from intercap_core.scene.slips import Slips, constant_slip, find_slips
 from intercap_core.scene.start_times import find_starts
@@ -49,7 +49,7 @@ def check_stated_starts(
             start_sigma = step / 2
         start = (starts.sets[c] + constant[c]) * step - timing.offset[c]
         away = np.hypot(start_sigma, stated.sigma[c])
-        if abs(start - stated.late[c]) > OUTLIER_SIGMA * away:
+        if abs(start - stated.late[c]) > OUTLIER_SIGMAS * away:
             rejected[c], sigma[c] = True, np.nan
             late[c] = starts.sets[c] * step - timing.offset[c]
         elif constant[c] != 0:

@@ -22,8 +22,8 @@ import numpy as np
 
 from intercap_core.formats.recordings.synchronise import usual_steps
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 from intercap_core.scene.keypoint_motion import (
-    OUTLIER_SIGMA,
     KeypointMotion,
     build_motion,
     with_keypoints,
@@ -212,7 +212,7 @@ def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
     size = np.linalg.norm(motion.residual, axis=-1)
     for late in moved:
         size = np.minimum(size, np.linalg.norm(motion.residual - late, axis=-1))
-    return replace(motion, valid=motion.seen & (size < OUTLIER_SIGMA * motion.sigma))
+    return replace(motion, valid=motion.seen & (size < OUTLIER_SIGMAS * motion.sigma))
 
 
 def _robust_gain(gains: np.ndarray) -> float:
@@ -356,7 +356,7 @@ class _Slipped:
         They are not whitened over time, because whitening amplifies fast errors of the paths.
         """
         left = self.series[:, first:end] - self.change[:, first:end]
-        return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
+        return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMAS**2).sum())
 
     def best(self, step: int) -> SlipInterval:
         """The interval of greatest gain. Sets are counted within the window; ``camera`` is 0."""

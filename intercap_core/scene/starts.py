@@ -19,7 +19,7 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.synchronise import in_step_sigma
-from intercap_core.scene.keypoint_motion import OUTLIER_SIGMA
+from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 
 NOT_DETERMINED = "start not determined"  # begins the note of a camera that was not moved
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
@@ -92,13 +92,13 @@ class StatedStarts:
 
         ``step_s``: seconds per set. ``reach``: the bound for cameras without a statement.
         """
-        away = OUTLIER_SIGMA * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
+        away = OUTLIER_SIGMAS * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
     def states_apart(self, step_s: float) -> bool:
         """Whether a statement contradicts the images' own times by at least two sets beyond its
         accuracy."""
-        least = 2 * step_s + OUTLIER_SIGMA * self.sigma
+        least = 2 * step_s + OUTLIER_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
@@ -137,7 +137,7 @@ class StatedStarts:
             if not self.known[c]:
                 late[c], sigma[c], source[c] = other.late[c], other.sigma[c], other.source[c]
                 continue
-            if abs(late[c] - other.late[c]) > OUTLIER_SIGMA * np.hypot(sigma[c], other.sigma[c]):
+            if abs(late[c] - other.late[c]) > OUTLIER_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
                 odd[c] = (
                     f"{source[c]} states that it started {describe_start(late[c])}, "
                     f"{other.source[c]} {describe_start(other.late[c])}; the former is used"

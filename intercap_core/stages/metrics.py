@@ -81,7 +81,7 @@ def run(
         true_facing = values.pop("true_facing", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
-        flags = _flags(images, paths)
+        flags = _flags(images, paths, has_object=object_ is not None)
         if handled is not None:
             values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
@@ -131,7 +131,7 @@ def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) ->
     return values
 
 
-def _flags(images: Frames, paths: SequencePaths) -> Flags:
+def _flags(images: Frames, paths: SequencePaths, *, has_object: bool) -> Flags:
     """Flags of the joint result, and those of missing images and of exchanged sides."""
     with artefacts.read(paths.person, PERSON) as artefact:
         missing = artefact["missing"]
@@ -146,7 +146,7 @@ def _flags(images: Frames, paths: SequencePaths) -> Flags:
         (swapped["legs"], text.format("legs"), ["body"]),
         (swapped["arms"], text.format("arms"), OF_BODY),
     ]
-    return Flags.of(len(joints), causes) | of_joint
+    return Flags.of(len(joints), causes, has_object=has_object) | of_joint
 
 
 def _extrinsics_errors(

@@ -67,11 +67,9 @@ class TrueAndStated(NamedTuple):
     sigma: np.ndarray
 
     def rms(self) -> tuple[float, float]:
-        """Root mean square of the errors, and of the standard deviations, where both are known."""
-        known = np.isfinite(self.error) & np.isfinite(self.sigma)
-        if not known.any():
-            return float("nan"), float("nan")
-        error, sigma = (float(np.sqrt(np.mean(np.square(values[known])))) for values in self)
+        """Root mean square of the known errors, and of the known standard deviations."""
+        known = (values[np.isfinite(values)] for values in self)
+        error, sigma = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in known)
         return error, sigma
 
 

@@ -163,8 +163,8 @@ class DistanceField:
         """Return whether points (N, 3) are inside the solid: (N,) bool.
 
         In a watertight mesh, points outside of the bounding box need no ray, and most others one.
-        If it is odd, the majority of five rays decides: a ray through an edge may count
-        it twice or not at all.
+        If its number of crossings is odd, the majority of five rays decides: a ray through an edge
+        may count it twice or not at all.
         """
         query = np.asarray(points, np.float32).reshape(-1, 3)
         if self._open is not None:

@@ -100,7 +100,8 @@ def import_joint(
     with torch.no_grad():
         posed = model.forward(params, vertex_ids=model.keypoint_map.vertex_ids)
         keypoints = model.keypoints(posed).double().numpy()
-    flags = released.flags or Flags.of(total, [(~known, "no result in the imported file", PARTS)])
+    missing = (~known, "no result in the imported file", PARTS)
+    flags = released.flags or Flags.of(total, [missing], has_object=object_ is not None)
     variation = _shape_variation(model, released.betas[known], shape)
     if variation > 0.001:
         log.warning(

@@ -78,7 +78,8 @@ def read_results(folder: Path, recording: Recording) -> Results:
     distance = np.full((total, 2), np.nan)
     distance[person.frames] = fitted.distance
     known = np.isfinite(vectors).all(1)
-    if np.isfinite(translation).any():
+    has_object = bool(np.isfinite(translation).any())
+    if has_object:
         posed = np.isfinite(translation).all(1)
         reasons[known & ~posed] = "no pose of the object in the imported files"
         known &= posed
@@ -107,7 +108,7 @@ def read_results(folder: Path, recording: Recording) -> Results:
         translation=translation,
         source=f"BEHAVE, {folder.name}; body fitted to its meshes, {mean:.1f} mm from them in the "
         f"mean (95th percentile {p95:.1f} mm)",
-        flags=Flags.of(total, [*lacking, far_off]),
+        flags=Flags.of(total, [*lacking, far_off], has_object=has_object),
         surface_distance=distance,
     )
 

@@ -1,0 +1,19 @@
+"""Flags by part."""
+
+import numpy as np
+
+from intercap_core.flags import OF_BODY, OF_OBJECT, PARTS, Flags
+
+
+def test_a_cause_flags_its_parts_and_the_others_stay_trusted():
+    lost, unseen = np.array([1, 0, 1], bool), np.array([0, 0, 1], bool)
+    flags = Flags.of(3, [(lost, "object lost", OF_OBJECT), (unseen, "no images", PARTS)])
+    assert flags.flagged.astype(int).tolist() == [[0, 0, 1, 1], [0, 0, 0, 0], [1, 1, 1, 1]]
+    assert flags.reasons == ["object lost", "", "object lost; no images"]
+    assert flags.texts()[0] == "object, contact: object lost"
+
+
+def test_a_person_alone_has_no_flags_of_object_and_contact():
+    flags = Flags.of(1, [(np.array([True]), "not seen", OF_BODY)], has_object=False)
+    assert flags.flagged.tolist() == [[True, True, False, False]]
+    assert flags.summary() == "flagged: body 1, hands 1 of 1 frames"
