@@ -316,6 +316,14 @@ def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
         for control in page.locator(".viewer :is(button, select, label):visible").all():
             at = control.bounding_box()
             assert at is not None and at["height"] >= 40, control.inner_text()
+        page.evaluate("scrollTo(0, 0)")
+        view = _far(visited)
+        visited.touch("touchStart", (x, y))
+        for by in range(20, 201, 20):
+            visited.touch("touchMove", (x, y - by))
+        visited.touch("touchEnd")
+        visited.wait("scrollY > 50")
+        assert np.allclose(_far(visited)[1], view[1], atol=1e-6)  # the page moved, not the scene
         assert visited.console == []
 
 

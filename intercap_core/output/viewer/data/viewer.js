@@ -18,10 +18,7 @@ async function showInterCap(payload) {
   try {
     data = typeof payload === "string"
       ? await unpack(new Blob([Uint8Array.from(atob(payload), (letter) => letter.charCodeAt(0))])) : payload;
-  } catch (error) {
-    say(`This browser cannot read the data of the sequence: ${error.message}`);
-    return;
-  }
+  } catch (error) { return say(`This browser cannot read the data of the sequence: ${error.message}`); }
   const { header, arrays } = data;
 
   let renderer;
@@ -200,10 +197,15 @@ async function showInterCap(payload) {
   }, { capture: true, passive: true });
   canvas.addEventListener("pointerdown", (event) => {
     controls.enableZoom = true;
-    pressed = event;
+    pressed = { x: event.clientX, y: event.clientY, eye: eye.position.clone(), target: controls.target.clone() };
   }, { capture: true });
+  canvas.addEventListener("pointercancel", () => { // the browser scrolls instead
+    eye.position.copy(pressed.eye);
+    controls.target.copy(pressed.target);
+    controls.update();
+  });
   canvas.addEventListener("click", (event) => {
-    if (!measurement.on || Math.hypot(event.clientX - pressed.clientX, event.clientY - pressed.clientY) > 4) return;
+    if (!measurement.on || Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) > 4) return;
     const [ray, { mesh, object }] = rayAt(event);
     measurement.click(ray, object?.mesh.visible ? [mesh, object.mesh] : [mesh], header.floor);
     draw();
