@@ -136,6 +136,7 @@ def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):
     [
         (["033", "066", "100", "133"], 30, "milliseconds"),
         (["1000", "1040", "1080"], 25, "milliseconds"),
+        (["0", "33", "66", "99"], 30, "milliseconds"),
         (["k1_1616161616000", "k1_1616161616033", "k1_1616161616067"], 30, "milliseconds"),
         (["0_33333", "1_66667", "2_100000"], 30, "microseconds"),
         (["color_0-1633342743123.45", "color_1-1633342744156.78"], 30, "milliseconds"),

@@ -130,12 +130,14 @@ def pair_images(
 def _refuse_whole_times(numbers: list[float], fps: float, source: Path) -> None:
     """Raise UserError if sorted whole numbers of images are times in a fraction of a second.
 
-    They are if the median step is the period of ``fps``: exactly, or roughly if steps differ.
+    They are if the median step is the period of ``fps``: roughly, or to rounding if all steps are
+    equal.
     """
     steps = np.diff(numbers)
     if not len(steps) or np.median(steps) < 2:
         return
-    tolerance = 0.25 if (steps % steps.min()).any() else 1e-9
+    rounding = 0.5 / np.median(steps)
+    tolerance = 0.25 if (steps % steps.min()).any() else rounding
     for unit, name in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
         if abs(np.median(steps) * unit * fps - 1) <= tolerance:
             raise UserError(
