@@ -12,6 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from intercap_core.cli import app
+from intercap_core.formats.detections.candidate_files import holds_instances
+from intercap_core.formats.detections.coco import HEAD_BYTES
+from intercap_core.formats.detections.keypoint_files import holds_people
 from intercap_core.project import Project, load_project
 from tests.helpers.plain_capture import CAMERAS, write_rig
 
@@ -71,6 +74,15 @@ def test_what_can_be_seen_is_written(folder: Path) -> None:
     assert (alone.object, alone.keypoints, alone.candidates) == (None, None, None)
     assert set(project.objects) == {"cup", "suitcase"}
     assert "2 of 2 sequences are ready to run" in output
+
+
+def test_large_files_of_a_data_set_are_recognised(tmp_path: Path) -> None:
+    images = [{"id": number, "file_name": f"{number:0100d}.jpg"} for number in range(2000)]
+    person = INSTANCE | {"keypoints": [10.0, 20.0, 0.9] * 17}
+    content = json.dumps({"images": images, "annotations": [person]})
+    assert len(content) > HEAD_BYTES
+    (tmp_path / "left.json").write_text(content)
+    assert holds_instances(tmp_path, "left", "plain") and holds_people(tmp_path, "left")
 
 
 def test_what_cannot_be_seen_is_marked_and_has_a_default(folder: Path) -> None:

@@ -17,6 +17,7 @@ from intercap_core.formats.detections.coco import (
     DetectionPreview,
     UnreadableDetections,
     parse_candidates,
+    read_first,
     read_head,
     read_json,
 )
@@ -81,7 +82,7 @@ def holds_instances(folder: Path, camera: str, layout: str) -> bool:
     if path is None:
         return has_candidates(folder, camera, layout)
     try:
-        content = read_head(path)
+        content = read_first(path)
         return bool(parse_candidates(content, CandidateForm((1, 1), {}, 0.0)).entries)
     except UnreadableDetections:
         return False

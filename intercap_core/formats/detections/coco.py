@@ -195,6 +195,15 @@ def read_head(path: Path) -> Any:
         entries.append(entry)
 
 
+def read_first(path: Path) -> Any:
+    """Parse a file; of a long list of results, only the first ones.
+
+    Raises :class:`UnreadableDetections` as :func:`read_json` does.
+    """
+    content = read_head(path)
+    return read_json(path) if content is None else content
+
+
 def read_json(path: Path) -> Any:
     """Parse a file; raises :class:`UnreadableDetections` if it is no JSON or too large."""
     content = _bytes(path)

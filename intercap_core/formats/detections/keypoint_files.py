@@ -19,6 +19,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import (
     DetectionPreview,
     UnreadableDetections,
+    read_first,
     read_head,
     read_json,
 )
@@ -426,12 +427,12 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
 
 
 def _load_first(
-    folder: Path, camera: str, notes: list[str]
+    folder: Path, camera: str, notes: list[str], load: Callable[[Path], Any] = read_head
 ) -> tuple[dict[Path, Any], KeypointReader] | None:
     """Load the beginning of a camera's file, or some of its files of one image.
 
-    Returns the contents by path and the files' reader, or None without files. Files that cannot be
-    loaded are added to ``notes``.
+    Returns the contents by path and the files' reader, or None without files. ``load`` parses JSON;
+    files that cannot be loaded are added to ``notes``.
     """
     whole = find_camera_file(folder, camera)
     single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
@@ -445,7 +446,7 @@ def _load_first(
     loaded: dict[Path, Any] = {}
     for path in paths:
         try:
-            content = read_head(path) if reader.load is read_json else reader.load(path)
+            content = load(path) if reader.load is read_json else reader.load(path)
         except UnreadableDetections as error:
             notes.append(f"{path} {error}")
             continue
@@ -456,7 +457,7 @@ def _load_first(
 
 def holds_people(folder: Path, camera: str) -> bool:
     """Whether the first files of a camera hold keypoints of a person."""
-    loaded, reader = _load_first(folder, camera, []) or ({}, readers()[0])
+    loaded, reader = _load_first(folder, camera, [], read_first) or ({}, readers()[0])
     one_image = find_camera_file(folder, camera) is None
     for content in loaded.values():
         try:
