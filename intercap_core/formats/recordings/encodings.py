@@ -51,11 +51,15 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
     """Width and height of a JPEG or PNG file; None if the content is no complete file.
 
     The size is that of the image as OpenCV decodes it: rotated by a JPEG's Exif orientation. The
-    image's end must be there (anything may follow that of a JPEG), and in a JPEG a scan. Pixels are
-    not decoded.
+    image's end must be there (anything may follow that of a JPEG), and in a JPEG a scan. The chunks
+    of a PNG must fill the file: decoders reserve the memory that a chunk's length states. Pixels
+    are not decoded.
     """
     if content.startswith(PNG_START):
-        complete = content.endswith(PNG_END) and len(content) >= 33
+        at = len(PNG_START)
+        while at < len(content):  # a chunk has 12 bytes more than its length states
+            at += 12 + int.from_bytes(content[at : at + 4], "big")
+        complete = content.endswith(PNG_END) and len(content) >= 33 and at == len(content)
         return struct.unpack(">II", content[16:24]) if complete else None
     jpeg = _parse_jpeg(content)
     if jpeg is None or not jpeg.ended:

@@ -14,7 +14,6 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encodings import (
-    PNG_END,
     PNG_START,
     TIFF_STARTS,
     DamagedImage,
@@ -73,7 +72,7 @@ def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.n
     content = read_content(path)
     if content.startswith(PNG_START):
         _check_depth_head(content, size)
-        if not content.endswith(PNG_END):
+        if encoded_size(content) is None:
             raise DamagedImage("is cut off")
     elif not content.startswith(TIFF_STARTS):
         raise DamagedImage("is no PNG or TIFF")

@@ -189,6 +189,16 @@ def test_a_tiff_is_turned_once_or_not_at_all(orientation, order):
         assert np.abs(shown(stored).astype(int) - true).mean() < 2
 
 
+@pytest.mark.parametrize("length", [0, 0x7F0002FE, 0xFFFFFFFF])
+def test_a_png_whose_chunk_has_another_length_is_cut_off(tmp_path, length):
+    depth = encoded(".png", np.zeros((30, 50), np.uint16))
+    damaged = depth[:33] + struct.pack(">I", length) + depth[37:]
+    (tmp_path / "depth.png").write_bytes(damaged)
+    assert encoded_size(depth) == (50, 30) and encoded_size(damaged) is None
+    with pytest.raises(DamagedImage, match="is cut off"):
+        read_depth(tmp_path / "depth.png", (50, 30))
+
+
 @pytest.mark.parametrize("form", ["TIFF", "PNG"])
 def test_depth_that_states_an_orientation_is_refused(tmp_path, form):
     depth, exif, path = np.arange(6, dtype=np.uint16).reshape(2, 3), Image.Exif(), tmp_path / "d"
