@@ -127,6 +127,9 @@ def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):
     ]
     assert [shot.time_us for shot in shots if shot.depth] == [1560000083950000, 1560000084017000]
     assert [shot.time_us for shot in pairs(["k1.0000.png", "k1.0002.png"], [])] == [0, 66_667]
+    assert [shot.time_us for shot in pairs(["0000.1.png", "0001.1.png"], [])] == [0, 33_333]
+    with pytest.raises(UserError, match="no time between images at 5 a second"):
+        pairs(names, [], fps=5)
     with pytest.raises(UserError, match="number both alike"):
         pairs(names, ["0000.png"])
 

@@ -25,6 +25,7 @@ from intercap_core.formats.recordings.encodings import (
     store_colour,
 )
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
+from intercap_core.formats.recordings.synchronise import distance_to
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.solve.time_series import sample_evenly
@@ -245,7 +246,10 @@ def read_pairs(
             except DamagedImage as error:
                 damaged.append(f"{depth.name} {error}")
     recording.notes += list_remarks(remarks)
-    without = sum(shot.colour is not None and shot.depth is None for shot in shots)
+    of_colour, of_depth = (
+        np.sort([shot[0] for shot in shots if shot[kind] is not None]) for kind in (1, 2)
+    )
+    without = int((distance_to(of_colour, of_depth) > 0.5e6 / recording.fps).sum())
     if lens is not None and without:
         recording.notes.append(f"no depth image with {without} of its colour images")
     if damaged:

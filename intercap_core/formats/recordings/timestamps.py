@@ -14,7 +14,7 @@ from intercap_core.inputs.files import quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
-_DECIMAL = re.compile(r"(\d+)\.\d+(?=\D*$)")  # the last number of a name
+_DECIMAL = re.compile(r"(\d+)\.(\d+)(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
 
 
@@ -86,7 +86,7 @@ def pair_images(
     """Pair colour and depth files of one camera, with their times.
 
     Files are paired by the last number in their names, or by order if any name has no number of its
-    own. Decimal numbers whose whole part changes (1305031102.175304.png) are times in seconds.
+    own. Decimal numbers of which both parts change (1305031102.175304.png) are times in seconds.
     Raises UserError, naming ``source``, if times are unknown or missing, or if whole numbers in the
     names are times.
 
@@ -104,7 +104,15 @@ def pair_images(
     if times is not None:
         seconds = _stated(pairs, times, source)
     elif named_by_time:
-        _check_seconds(source, [key for key in keys if pairs[key][0] or not colour])
+        taken = [key for key in keys if pairs[key][0] or not colour]
+        _check_seconds(source, taken)
+        step = float(np.median(np.diff(taken))) if len(taken) > 1 else None
+        if fps and step and not 1 / 1.5 < step * fps < 1.5:
+            raise UserError(
+                f"{source}: the numbers in the names are {step:g} apart, which is no time between "
+                f"images at {fps:g} a second; correct fps, or write a timestamps.csv in seconds "
+                "('name, seconds')"
+            )
         seconds = {key: key for key in keys}
     elif fps is None:
         raise UserError(
@@ -189,9 +197,13 @@ def _decimal(path: Path) -> float | None:
 
 
 def _are_times(paths: list[Path]) -> bool:
-    """Whether all names end in decimal numbers, and not all of one whole part (k1.0001.png)."""
+    """Whether all names end in decimal numbers.
+
+    Names of one whole part (k1.0001.png), or of one decimal part (0001.k1.png), have two numbers.
+    """
     found = [_DECIMAL.search(path.stem) for path in paths]
-    return len({match[1] for match in found if match}) > 1 and None not in found
+    parts = zip(*(match.groups() for match in found if match), strict=True)
+    return None not in found and all(len(set(part)) > 1 for part in parts) and bool(found)
 
 
 def _stated(
