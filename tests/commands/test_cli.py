@@ -359,7 +359,7 @@ def test_check_reads_the_first_candidates(inside: Path, content: str | list, say
     assert not says or says in notes[0]
 
 
-WHOLE_BODY = [v for i in range(133) for v in (10.0 + i, 20.0, 0.5)]
+WHOLE_BODY = [v for i in range(133) for v in (10.0 + i, 400.0, 0.5)]
 FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,9 +73,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
 
 
 @pytest.fixture
-def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An empty working directory, in which the logs are written."""
-    monkeypatch.chdir(tmp_path)
+def logs(project: Project) -> None:
+    """Remove the logs of earlier tests."""
+    shutil.rmtree(project.logs, ignore_errors=True)
 
 
 @pytest.mark.parametrize("stage", SEQUENCE_STAGES)

@@ -63,7 +63,7 @@ def behave(tmp_path) -> SequenceEntry:
             cv2.imwrite(str(folder / f"k{c}.person_mask.jpg"), square(10 + t, 30))
             cv2.imwrite(str(folder / f"k{c}.obj_rend_mask.png"), square(100 + t, 20 + c))
             joints = {
-                "body_joints": [10.0 + t, 5.0, 0.5] * 25,
+                "body_joints": [10.0 + t, 95.0, 0.5] * 25,
                 "left_hand_joints": [1.0, 2.0, 0.25] * 21,
                 "right_hand_joints": [3.0, 4.0, 0.25] * 21,
                 "face_joints": [5.0, 6.0, 0.75] * 70,
@@ -83,7 +83,7 @@ def test_behave_keypoints_and_masks_are_read(behave, tmp_path):
         for c in range(2):
             people = read.people(t, c)
             assert people.shape == (1, 135, 3)
-            assert people[0, 3].tolist() == [10 + t, 5, 0.5]
+            assert people[0, 3].tolist() == [10 + t, 95, 0.5]
             assert people[0, 30].tolist() == [1, 2, 0.25] and people[0, 60].tolist() == [3, 4, 0.25]
             assert people[0, 134].tolist() == [5, 6, 0.75]
             person, thing = read.candidates(t, c)

@@ -232,7 +232,7 @@ def test_stated_start_aligns_cameras_without_motion(tmp_path):
     np.testing.assert_allclose(late[:3], [0, -0.48, 0.2], atol=0.02)  # of keypoints, noise
     assert (slip == slip[0]).all()
     np.testing.assert_allclose(sigma[1:3], [0.028, 0.045], rtol=0.25)
-    assert "its start rests on the annotation: 0.4" in notes[1]
+    assert "its start is that of the annotation: 0.4" in notes[1]
     assert "s later than its times say, known to 0.02" in notes[1]
     assert "s earlier than its times say, known to 0.03" in notes[2]
     # nobody states when the others started: they are set aside, and it is said what to do
@@ -242,7 +242,7 @@ def test_stated_start_aligns_cameras_without_motion(tmp_path):
 def test_starts_without_common_time_are_rejected(tmp_path):
     paths = standing(tmp_path)
     starts = {"k1": (0.0, 0.02), "k2": (480.0, 0.02)}  # milliseconds
-    with pytest.raises(UserError, match=r"sequence test: .* k2 start 480\.000 s later .* 1\.9 s"):
+    with pytest.raises(UserError, match=r"sequence test: .* k2 started 480\.000 s later .* 1\.9 s"):
         run(paths, starts=starts)
 
 
@@ -255,8 +255,8 @@ def test_sound_aligns_cameras_without_motion(tmp_path):
         seen = (found["image_of"] >= 0).any(0)
     np.testing.assert_allclose(late[:5], [0, -0.9, 0.2, -0.02, -0.3], atol=0.03)
     assert seen.tolist() == [True] * 5 + [False]
-    assert "its start rests on the sound: 0." in notes[2]
-    assert "its start rests on the annotation: 0." in notes[1]
+    assert "its start is that of the sound: 0." in notes[2]
+    assert "its start is that of the annotation: 0." in notes[1]
 
 
 def test_sound_does_not_change_synchronised_cameras(tmp_path):

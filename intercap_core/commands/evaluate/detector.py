@@ -67,9 +67,14 @@ class TrueAndStated(NamedTuple):
     sigma: np.ndarray
 
     def rms(self) -> tuple[float, float]:
-        """Root mean square of the known errors, and of the known standard deviations."""
-        known = (values[np.isfinite(values)] for values in self)
-        error, sigma = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in known)
+        """Root mean square of the known errors, and of their known standard deviations."""
+        known = np.isfinite(self.error)
+        error, sigma = (
+            float(np.sqrt(np.mean(values[known & np.isfinite(values)] ** 2)))
+            if (known & np.isfinite(values)).any()
+            else float("nan")
+            for values in self
+        )
         return error, sigma
 
 
