@@ -23,7 +23,7 @@ from intercap_core.object_track.appearance import LIGHT, Appearance, SurfaceColo
 from intercap_core.object_track.decoder import HIDDEN, Decoded, decode_given, mix_decisions
 from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.fit import FittedPose, seen_by
-from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses
+from intercap_core.object_track.hypotheses import RIVAL_PROBABILITY, Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import KEY_FRAME_S
 from intercap_core.object_track.view_report import choose_candidate
@@ -62,7 +62,7 @@ class ColourDecision:
             return decoded
         own = decoded.probability[first][:-1]
         # gauges: up to three likely hypotheses of the reference frame
-        gauges = [int(k) for k in np.argsort(-own)[:3] if own[k] > np.exp(-RIVAL_LOG_RATIO)]
+        gauges = [int(k) for k in np.argsort(-own)[:3] if own[k] > RIVAL_PROBABILITY]
         relative = {k: decode_given(emissions, steps, first, k, self._absent) for k in gauges}
         rivals = self._ambiguous(list(relative.values()))
         if not gauges or (not rivals and (self._observer.paint is None or len(gauges) == 1)):
@@ -89,7 +89,7 @@ class ColourDecision:
         rivals = {}
         for t in range(0, len(relative[0].path) if relative else 0, every):
             likely = np.array(
-                [result.probability[t][:-1] > np.exp(-RIVAL_LOG_RATIO) for result in relative]
+                [result.probability[t][:-1] > RIVAL_PROBABILITY for result in relative]
             )
             if any(
                 own.sum() > 1 or (own.any() and result.path[t] == HIDDEN)

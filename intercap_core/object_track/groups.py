@@ -25,9 +25,9 @@ from intercap_core.geometry.camera.triangulation import midpoints
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.object_silhouette import rim_pixels
 from intercap_core.object_track.view import MaskCandidate, View
-from intercap_core.object_track.view_report import MIN_RENDERED_PX
 
 OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled; tuned
+LOCATED_MIN_POINTS = 15  # of a candidate's point cloud, or pixels of its mask; tuned on the studio
 
 
 def _unit_circle(count: int) -> np.ndarray:
@@ -312,7 +312,7 @@ def _locate_by_outline(views: list[View], labels: tuple[str, ...]) -> list[Locat
         for candidate in _possible_candidates(view) if view.depth is None else ():
             label_prior = _label_prior(candidate.label, labels)
             located = LocatedCandidate(number, candidate, label_prior, np.zeros((0, 3)), None, view)
-            if candidate.mask.area >= MIN_RENDERED_PX and located.outline is not None:
+            if candidate.mask.area >= LOCATED_MIN_POINTS and located.outline is not None:
                 result.append(located)
     return result
 
@@ -340,11 +340,11 @@ def _locate_by_depth(
         pixel = np.rint(geometry.lens.project(apply(camera.colour_from_depth, local))).astype(int)
         for candidate in candidates:
             inside = np.flatnonzero(candidate.mask.sample(pixel[:, 0], pixel[:, 1]))
-            if len(inside) < MIN_RENDERED_PX:
+            if len(inside) < LOCATED_MIN_POINTS:
                 continue
             z = depth[inside]
             inside = inside[np.abs(z - np.median(z)) < most_m]
-            if len(inside) < MIN_RENDERED_PX:
+            if len(inside) < LOCATED_MIN_POINTS:
                 continue  # two surfaces, with the middle between them
             points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
             centre = np.median(points, axis=0)

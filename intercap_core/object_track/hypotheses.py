@@ -33,7 +33,8 @@ from intercap_core.object_track.turns import UNSURE_M, UNSURE_RAD, distinct_pose
 # Largest number of hypotheses of a frame: enough for a mug turned in steps of 30 degrees. With 6,
 # the true turn of a mug was dropped.
 MAX_HYPOTHESES = 12  # tuned on the studio
-RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are dropped, nats; tuned
+RIVAL_PROBABILITY = 0.01  # hypotheses below this probability are not considered further; tuned
+RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not followed, nats; tuned
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
 # Poses within this distance of an annotated pose may show the annotated object.
 ANNOTATED_REACH_M = 0.2  # metres; tuned
@@ -212,7 +213,7 @@ class Hypotheses:
                 twist = shift_twist(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
                 turn, shift = np.abs(twist - fit.twist).reshape(2, 3).max(1) * late
                 unchanged = turn < np.radians(0.5) and shift < 0.003
-                if unchanged or decoded.probability[t][k] < np.exp(-RIVAL_LOG_RATIO):
+                if unchanged or decoded.probability[t][k] < RIVAL_PROBABILITY:
                     continue
                 prior = MotionPrior(fit.pose)
                 again = self._observer.fit(t, fit.pose, prior, FIT_ROUNDS, twist=twist)

@@ -28,7 +28,7 @@ from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
 SEEN_LOG_RATIO = 3.0  # the images show the object; tuned
-# Log-likelihood ratio that ends the search of a frame and overrules annotated poses; tuned.
+# Log-likelihood ratio that ends the search of a frame; tuned.
 DECISIVE_LOG_RATIO = 25.0
 CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose; tuned
 CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution; tuned

@@ -12,7 +12,6 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
 from intercap_core.object_track.decoder import HIDDEN, Decoded
-from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses, Prior
@@ -26,8 +25,12 @@ from intercap_core.object_track.turns import (
     find_near_symmetries,
 )
 
+SEED_SURE_LOG_RATIO = 40.0  # a first frame with this weight ends the search, nats; tuned
 KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
 DOUBTFUL_PROBABILITY = 0.9  # below this probability of its hypothesis a frame is uncertain; tuned
+# Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
+# three views see past the object. An occluded frame reaches -6, and so does chance.
+DENIED_LOG_RATIO = -25.0  # nats; tuned on five objects at noise 2 with two cameras of the studio
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +47,7 @@ class Proposals:
         self._hypotheses = hypotheses
         self._prior = prior
         self._times = observer.times
-        self._reach = observer.frames_in(ERROR_LASTING_S)
+        self._reach = observer.frames_in(0.3)
         self._searched: set[int] = set()
         self._searched_near_annotated: set[int] = set()
         self._searched_nearby: set[int] = set()
@@ -64,7 +67,7 @@ class Proposals:
             if fits:
                 best = float(self._prior.weigh(t, fits).max())
                 results.append((best, t, fits))
-                if best > DECISIVE_LOG_RATIO:
+                if best > SEED_SURE_LOG_RATIO:
                     break
         if not results:
             raise NotFound
@@ -87,8 +90,7 @@ class Proposals:
         if not fits or not given.holds(self._observer.mesh, wide.pose):
             prior = MotionPrior(pose, given.sigma_m, given.sigma_rad)
             own = self._observer.fit(t, pose, prior, FIT_ROUNDS)
-            # occlusion reaches -6 nats; -25 needs two or three views that see past the object
-            if own.log_ratio > -DECISIVE_LOG_RATIO:
+            if own.log_ratio > DENIED_LOG_RATIO:
                 fits.append(own)
         if not fits:
             return False

@@ -23,7 +23,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.object_track.fit import DEPTH_SCALES_M, FittedPose, assess_all, fit_pose
+from intercap_core.object_track.fit import FittedPose, assess_all, fit_pose
 from intercap_core.object_track.groups import (
     Group,
     find_groups,
@@ -35,6 +35,11 @@ from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO, SEEN_LOG_R
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.turns import axis_turns, distinct_poses, rotation_grid
 from intercap_core.object_track.view import FitContext, View
+
+ICP_MAX_RESIDUAL_M = 0.05  # larger residuals of the alignment count as this; tuned on the studio
+# A start that is this much worse than the best fit, nats, is not fitted: a fit gains up to 15 nats,
+# measured on the studio (bottle to chair).
+HOPELESS_LOG_RATIO = 15.0
 
 
 def search_pose(
@@ -69,8 +74,7 @@ def search_pose(
         fits: list[FittedPose] = []
         for start in starts:
             best = max([best, *(fit.log_ratio for fit in fits)])
-            # a fit gains up to 15 nats, measured on the studio (bottle to chair)
-            if start.log_ratio > best - DECISIVE_LOG_RATIO:
+            if start.log_ratio > best - HOPELESS_LOG_RATIO:
                 fits.append(fit_pose(fit_context, views, start.pose, twist=start.twist))
         return fits
 
@@ -183,7 +187,7 @@ def align(
             weighted = jacobian * weight[..., None]
             hessian += np.einsum("ndi,ndj->nij", weighted, jacobian)
             gradient -= np.einsum("ndi,nd->ni", weighted, gap)
-            costs.append(np.minimum(np.abs(gap[:, shape.known]), DEPTH_SCALES_M[0]))
+            costs.append(np.minimum(np.abs(gap[:, shape.known]), ICP_MAX_RESIDUAL_M))
         residual = np.concatenate(costs, 1).mean(1)
         hessian += 1e-3 * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
@@ -247,7 +251,7 @@ def _to_points(
     # a measured point cannot lie on a face that looks away from the camera
     facing = (to_eye * normals).sum(-1) > 0
     weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, 0.1)
-    cost = np.minimum(np.where(facing, distance, np.maximum(distance, 0.01)), DEPTH_SCALES_M[0])
+    cost = np.minimum(np.where(facing, distance, np.maximum(distance, 0.01)), ICP_MAX_RESIDUAL_M)
     jacobian = np.concatenate([np.cross(local, normals), normals], -1)
     weighted = jacobian * weight[..., None]
     hessian = np.einsum("npi,npj->nij", weighted, jacobian)

@@ -16,7 +16,7 @@ from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
-MIN_RENDERED_PX = 12  # renderings and masks with fewer pixels are not compared; tuned
+MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
 # Depth that differs from the render by more than this shows the background (farther) or an occluder
 # (nearer). The value is above the systematic errors of sensor and pose.
 FREE_SPACE_M = 0.03  # metres; tuned

@@ -39,12 +39,9 @@ from intercap_core.object_track.given_poses import (
     flag_edges,
     seconds_since,
 )
-from intercap_core.object_track.likelihood import (
-    CONTRADICTED_LOG_RATIO,
-    DECISIVE_LOG_RATIO,
-    SEEN_LOG_RATIO,
-)
+from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.proposals import DENIED_LOG_RATIO
 from intercap_core.object_track.rest import find_rests
 from intercap_core.object_track.smooth import smooth
 from intercap_core.object_track.turns import UNSURE_M, UNSURE_RAD
@@ -232,7 +229,7 @@ class WholeTrack:
         carried = smoothed.carried & unseen
         # a decided pose that lost 10 nats by smoothing fitted its frame only by chance
         contradicted = (unseen & (ratio < decided - 10)) | (ratio < CONTRADICTED_LOG_RATIO)
-        contradicted &= ~carried | (ratio < -DECISIVE_LOG_RATIO)
+        contradicted &= ~carried | (ratio < DENIED_LOG_RATIO)
         seen = ~contradicted & (~unseen | ~smoothed.lost)
         bridged = smoothed.in_hand | self._between_equal_poses(poses, ~seen)
         nothing = np.where(gone, FrameStatus.GONE, FrameStatus.LOST)
