@@ -45,7 +45,7 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 Positive = Annotated[float, Field(gt=0.0)]
 
-RESERVED_SEQUENCES = ("recordings", "site", "tables")  # other folders of the results
+RESERVED_SEQUENCES = ("export", "recordings", "site", "tables")  # other folders of the results
 
 Vector3 = tuple[float, float, float]
 

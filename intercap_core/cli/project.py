@@ -99,7 +99,9 @@ def tables(context: typer.Context, layout: str) -> None:
 
     Example: intercap tables intercap ~/InterCap --output config/intercap
     """
-    context.find_root().command.main(["init", *context.args], standalone_mode=False)
+    raise typer.Exit(
+        context.find_root().command.main(["init", *context.args], standalone_mode=False) or 0
+    )
 
 
 @app.command()

@@ -35,7 +35,6 @@ class ListTable(Table):
         for column in self.columns[:-1]:
             column.no_wrap = True
         wide = options.update(width=UNLIMITED)
-        wide = options.update(width=UNLIMITED)
         cells = [self.columns[-1].header, *self.columns[-1].cells]
         longest = max(Measurement.get(console, wide, cell).maximum for cell in cells)
         least = Measurement.get(console, wide, self).maximum - max(0, longest - LAST_COLUMN)
@@ -43,9 +42,6 @@ class ListTable(Table):
             yield from super().__rich_console__(console, options)
         else:
             yield from self._paragraphs(console)
-
-    def _last_cells(self) -> list[object]:
-        return [self.columns[-1].header, *self.columns[-1].cells]
 
     def _paragraphs(self, console: Console) -> Iterator[Text | Padding]:
         def text(cell: object) -> Text:

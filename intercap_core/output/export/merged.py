@@ -133,6 +133,10 @@ def _merge_coco(
 
 def _category(name: str, numbers: Mapping[str, int]) -> int:
     """Number of a class: 1 = person, then the objects."""
+    if name != "person" and name not in numbers:
+        raise UserError(
+            f"object {name!r} of an export is not in the list of objects; re-run stage 'export'"
+        )
     return 1 if name == "person" else 1 + numbers[name]
 
 
@@ -151,7 +155,7 @@ def _merge_bop(folder: Path, exports: Mapping[str, Path], numbers: Mapping[str, 
     (folder / "models").mkdir(parents=True)
     for name, own in exports.items():
         object_ = _load(own.parent / STAGES["export"].folder_marker)["object"]
-        number, before = numbers[object_], len(scenes)
+        number, before = _category(object_, numbers) - 1, len(scenes)
         ((own_number, model),) = _load(own / "models" / "models_info.json").items()
         if number not in names:
             names[number], models[str(number)] = object_, model
@@ -194,6 +198,8 @@ def _link(file: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(file, target)
+    except FileNotFoundError:
+        raise UserError(f"{file}: is missing; re-run stage 'export'") from None
     except OSError:  # the file system has no links, or no more of them
         shutil.copyfile(file, target)
 
