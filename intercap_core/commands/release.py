@@ -14,7 +14,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.output.release import manifest
 from intercap_core.pipeline.code_digest import code_digest
-from intercap_core.pipeline.plan import Plan
+from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project, tidy
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.versions import versions
@@ -88,14 +88,19 @@ def check_release(folder: Path) -> bool:
 
 def _check_complete(project: Project) -> None:
     """Raise UserError that names the sequences with damaged or missing outputs."""
-    broken = {}
-    for name, by_stage in Plan(project).all_faults().items():
+    broken, plan = {}, Plan(project)
+    for name, by_stage in plan.all_faults().items():
         faults = [*by_stage.values()]
         last = project.artefact(name, "summary") if name else project.site / "index.html"
         if not faults and not last.exists():
             faults = [f"{last}: is missing; run again"]
         if faults:
             broken[name or "the dataset"] = faults
+    if not broken and plan.dataset.status is OutputStatus.stale:
+        raise UserError(
+            f"{project.results}: tables, card and merged exports are of other sequences, settings "
+            "or results than the project's; nothing is released: run the project again"
+        )
     if not broken:
         return
     for name, found in broken.items():

@@ -462,6 +462,14 @@ def test_a_release_refuses_a_sequence_without_results(folder: Path) -> None:
         write_release(project, ["card"])
 
 
+def test_a_release_refuses_outputs_of_the_dataset_with_excluded_sequences(folder: Path) -> None:
+    """Merged exports would still hold the images of a sequence that is excluded."""
+    _bring_up_to_date(load_project(SETTINGS))
+    _set(folder, exclude=[ONE])
+    with pytest.raises(UserError, match="are of other sequences"):
+        write_release(load_project(SETTINGS), ["card"])
+
+
 def test_files_of_equal_names_in_folders_behind_links_count(folder: Path) -> None:
     mesh = load_project(SETTINGS).objects["cup"].mesh
     outside = folder / "textures"
