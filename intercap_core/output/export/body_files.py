@@ -1,8 +1,7 @@
-"""The open body in an export: the fitted file, and its content in two layouts of other readers.
+"""The open body in an export, in the layout of SMPL-X files: 300 shape and 100 expression columns.
 
-The project's file has 30 shape columns and 30 expression columns. Readers of SMPL-X files take the
-expression from column 10 if a file has fewer than 400 columns, otherwise from column 300. In the
-project's file they would find shape columns there.
+The project's file has 30 columns of each. Readers of SMPL-X files take the expression from column
+300, or from column 10 of a file of fewer than 400 columns: of the project's file, shape columns.
 """
 
 from __future__ import annotations
@@ -21,10 +20,7 @@ from intercap_core.output.export.about import ExportBody
 
 _POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a 3x3 matrix per joint except the pelvis
 _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the chest"
-
-
-# Numbers of shape columns, and of the expression columns that follow them, by layout
-_LAYOUTS = ((10, 10), (300, 100))
+_SHAPE, _EXPRESSION = 300, 100  # columns of a file of SMPL-X
 
 
 @dataclass(frozen=True)
@@ -42,52 +38,31 @@ class WrittenBody:
 
 
 def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
-    """Write the body file, its maps of points and regions, and a file per layout into ``folder``.
-
-    Layouts with fewer columns than the parameters are left out.
+    """Write the body file, and its maps of points and regions, into ``folder``.
 
     Columns beyond those of the parameters are zero, as are the pose blend shapes, which the open
-    body does not have. All other numbers are copied bit by bit. Returns the written files, none
-    for a licensed body.
+    body does not have. All other numbers are copied bit by bit. Returns the written file, none for
+    a licensed body.
     """
     if not body.is_open:
         return ()
     folder.mkdir()
-    shutil.copyfile(body.path, folder / body.path.name)
-    shutil.copyfile(maps_path(body.path), maps_path(folder / body.path.name))
+    path = folder / f"{body.path.stem}_{_SHAPE}_{_EXPRESSION}.npz"
+    shutil.copyfile(maps_path(body.path), maps_path(path))
     with np.load(body.path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    half = arrays["shapedirs"].shape[2] // 2  # shape columns; the others are the expression
-    written = [
-        WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}")
-    ]
-    for start, expression in _LAYOUTS:
-        if body.num_betas > start or body.num_expression > expression:
-            continue
-        path = folder / f"{body.path.stem}_{start}_{expression}.npz"
-        np.savez_compressed(
-            path, allow_pickle=True, **_laid_out(arrays, body, start, start + expression)
-        )
-        written.append(
-            WrittenBody(
-                path.name,
-                file_digest(path),
-                f"0:{body.num_betas}",
-                f"{start}:{start + body.num_expression}",
-            )
-        )
-    return written
+    np.savez_compressed(path, allow_pickle=True, **_laid_out(arrays, body))
+    expression = f"{_SHAPE}:{_SHAPE + body.num_expression}"
+    return (WrittenBody(path.name, file_digest(path), f"0:{body.num_betas}", expression),)
 
 
-def _laid_out(
-    arrays: dict[str, np.ndarray], body: ExportBody, start: int, total: int
-) -> dict[str, np.ndarray]:
-    """Return the arrays of the body file with the expression from column ``start`` of ``total``."""
+def _laid_out(arrays: dict[str, np.ndarray], body: ExportBody) -> dict[str, np.ndarray]:
+    """Return the arrays of the body file with its columns where readers of SMPL-X look."""
     table = arrays["shapedirs"]
-    vertices, half = len(table), table.shape[2] // 2
-    columns = np.zeros((vertices, 3, total), table.dtype)
+    vertices, half = len(table), table.shape[2] // 2  # shape columns, then the expression
+    columns = np.zeros((vertices, 3, _SHAPE + _EXPRESSION), table.dtype)
     columns[..., : body.num_betas] = table[..., : body.num_betas]
-    columns[..., start : start + body.num_expression] = table[
+    columns[..., _SHAPE : _SHAPE + body.num_expression] = table[
         ..., half : half + body.num_expression
     ]
     return {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from intercap_core.schemas import JOINT
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
 
-FULL, SMALL = "open_body_300_100.npz", "open_body_10_10.npz"
+FULL = "open_body_300_100.npz"
 
 
 def _peer(path: Path, *, flat_hand_mean: bool) -> Any:
@@ -101,73 +100,49 @@ def test_object_poses_of_both_formats_are_the_same_object(
             assert np.abs(stood - apply(zup_from_master, placed)).max() < 1e-6
 
 
-def _by_the_rule(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Ten shape and ten expression columns where readers of the field look: expression from column
-    10 of a file with fewer than 400 columns, from column 300 of any other."""
-    with np.load(path) as file:
-        table = file["shapedirs"]
-    start = 10 if table.shape[2] < 400 else 300
-    return table[..., :10], table[..., start : start + 10]
-
-
 def test_expression_is_where_readers_look_for_it(upright: Path, capture: fitted.Capture) -> None:
     with np.load(OPEN_BODY) as file:
         table = file["shapedirs"]
     head = capture.model.skinning_weights[:, [12, 15, 22, 23, 24]].sum(1).numpy()
-    for name, columns in ((SMALL, 20), (FULL, 400)):
-        path = upright / "body" / name
-        with np.load(path) as file:
-            assert file["shapedirs"].shape[2] == columns
-        shape, expression = _by_the_rule(path)
-        np.testing.assert_array_equal(shape, table[..., :10])
-        np.testing.assert_array_equal(expression, table[..., 30:40])
-        moved = np.linalg.norm(expression.astype(float), axis=1)
-        assert (moved.max(0) > 1e-4).all() and moved[head < 0.1].max() < 1e-6, "not of the face"
-    # which is what a reader would have made of the file that was fitted with
-    wrong = np.linalg.norm(_by_the_rule(OPEN_BODY)[1].astype(float), axis=1)
-    assert wrong[head < 0.1].max() > 1e-3
+    with np.load(upright / "body" / FULL) as file:
+        columns = file["shapedirs"]
+    assert columns.shape[2] == 400  # with fewer, readers take the expression from column 10
+    shape, expression = columns[..., :10], columns[..., 300:310]
+    np.testing.assert_array_equal(shape, table[..., :10])
+    np.testing.assert_array_equal(expression, table[..., 30:40])
+    moved = np.linalg.norm(expression.astype(float), axis=1)
+    assert (moved.max(0) > 1e-4).all() and moved[head < 0.1].max() < 1e-6, "not of the face"
 
 
-@pytest.mark.parametrize("name", [SMALL, FULL, "open_body.npz"])
-def test_each_body_file_loads_as_a_body_model(
-    name: str, upright: Path, lively: fitted.Capture, bodies: np.ndarray, tmp_path: Path
+def test_the_body_file_loads_as_a_body_model(
+    upright: Path, lively: fitted.Capture, bodies: np.ndarray
 ) -> None:
-    path = Path(shutil.copy(upright / "body" / name, tmp_path / name))
-    shutil.copy(upright / "body" / "open_body_maps.json", path.with_name(path.stem + "_maps.json"))
     with artefacts.read(lively.paths["joint"], JOINT) as joint:
-        vertices, _ = exported.posed(BodyModel.load(path), joint)
+        vertices, _ = exported.posed(BodyModel.load(upright / "body" / FULL), joint)
     assert np.abs(vertices - bodies).max() < 1e-7
 
 
-def test_body_files_are_listed_with_digest_and_columns(upright: Path) -> None:
+def test_the_body_file_is_listed_with_digest_and_columns(upright: Path) -> None:
     content = json.loads((upright / "export.json").read_text())
-    files = {path.name: path for path in (upright / "body").glob("*.npz")}
-    assert set(content["body_files"]) == set(files) == {SMALL, FULL, "open_body.npz"}
+    (path,) = (upright / "body").glob("*.npz")  # no reader has to choose
+    assert list(content["body_files"]) == [path.name] == [FULL]
     text = (upright / "README.txt").read_text()
-    for name, path in files.items():
-        entry = content["body_files"][name]
-        assert entry["digest"] == hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-        assert f"{name}, digest {entry['digest']}: betas {entry['betas']}" in text
-        assert f"expression {entry['expression']}" in text
-    assert content["body_files"][SMALL]["expression"] == "10:20"
-    assert content["body_files"][FULL]["expression"] == "300:310"
-    for name in (SMALL, FULL):
-        with np.load(files[name]) as file:
-            assert file["surface_model_type"] == "intercap-open-body"
-            assert file_digest(OPEN_BODY) in str(file["fitted_with"])
-            assert (str(file["up_axis"]), str(file["units"])) == ("y", "metres")
+    entry = content["body_files"][FULL]
+    assert entry["digest"] == hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    assert f"digest {entry['digest']}; columns of shapedirs: betas {entry['betas']}" in text
+    assert (entry["betas"], entry["expression"]) == ("0:10", "300:310")
+    with np.load(path) as file:
+        assert file["surface_model_type"] == "intercap-open-body"
+        assert file_digest(OPEN_BODY) in str(file["fitted_with"])
+        assert (str(file["up_axis"]), str(file["units"])) == ("y", "metres")
 
 
-@pytest.mark.parametrize(
-    ("betas", "expression", "names"),
-    [(10, 10, ["10_10", "300_100"]), (4, 10, ["10_10", "300_100"]), (16, 10, ["300_100"])],
-)
-def test_layouts_need_enough_shape_columns(
-    betas: int, expression: int, names: list[str], tmp_path: Path
+@pytest.mark.parametrize(("betas", "expression"), [(10, 10), (4, 10), (16, 10)])
+def test_columns_beyond_the_parameters_are_zero(
+    betas: int, expression: int, tmp_path: Path
 ) -> None:
     body = ExportBody(OPEN_BODY, "neutral", 13492, betas, expression)
     written = {file.name: file for file in body_files.write(tmp_path / "body", body)}
-    assert list(written)[1:] == [f"{OPEN_BODY.stem}_{name}.npz" for name in names]
     with np.load(OPEN_BODY) as file:
         table = file["shapedirs"]
     with np.load(tmp_path / "body" / FULL) as file:
