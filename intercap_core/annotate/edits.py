@@ -1,4 +1,4 @@
-"""Each entry of a sequence's annotation beside the result of the last run."""
+"""Comparison of each entry of a sequence's annotation with the result of the last run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STALE = "the result was computed before this edit: run the stale stages"
 
 
 def list_edits(opened: Opened, annotation: Annotation) -> list[dict[str, Any]]:
-    """Return the entries of an annotation with what the result has of them, for JSON.
+    """Return the entries of an annotation with the corresponding values of the result, for JSON.
 
     Each entry has ``section``, ``frame`` (to show), the texts ``annotated``, ``result`` and ``why``
     (reason of a difference), and ``same``: the result agrees. Entries that differ come first.
@@ -98,7 +98,7 @@ def _poses(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]:
     mesh = opened.cached("whole mesh", (), lambda: ObjectMesh.load(entry))
     for stated in annotation.poses:
         annotated = f"object placed in frame {stated.frame}"
-        fitted = poses[stated.frame]
+        fitted = poses[stated.frame] if stated.frame < len(poses) else np.array(np.nan)
         if not np.isfinite(fitted).all():
             yield _entry("object_poses", stated.frame, annotated, "no pose", same=False, why=_STALE)
             continue

@@ -78,7 +78,7 @@ def command(
 
 
 def expected_seconds(project: Project, sequence: str, stage: str) -> float | None:
-    """Return how long the last run of a stage took, from its log, or None if no log tells.
+    """Return how long the last run of a stage took, from its log, or None if no log states it.
 
     Without a duration for this sequence, the mean over at most ``_SEQUENCES`` others is returned.
     """

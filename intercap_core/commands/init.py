@@ -47,6 +47,8 @@ def write_tables(
         draft = intercap.draft(root, sources, dataset=name, objects=objects)
     elif behave.is_release(root):
         _refuse(sources, Sources(results=sources.results), "BEHAVE has fixed places for these")
+        if objects is not None:
+            raise UserError("--objects: not used, because BEHAVE has its own; leave the option out")
         name = _dataset(dataset or "behave")
         draft = behave.draft(root, dataset=name, results=sources.results)
     else:
@@ -94,6 +96,8 @@ def _cells(columns: dict[str, str | Path], cameras: list[str], root: Path) -> It
     yield ", ".join(cameras)
     for name in ("calibration", "keypoints", "candidates"):
         path = columns.get(name, "-")
+        if isinstance(path, Path) and not path.exists():
+            path = "-"
         inside = isinstance(path, Path) and path.is_relative_to(root)
         yield str(path.relative_to(root) if inside else path)  # type: ignore[union-attr]
     yield str(columns.get("object", "-"))

@@ -209,7 +209,10 @@ def snakemake_command(
     """
     profiles = shipped("workflow/profiles")
     if profile is not None:
-        places = [path for path in (profile, profiles / profile.name) if path.is_dir()]
+        places = [profile]
+        if profile.parent in (Path("."), Path("profiles")):  # may name one of the package
+            places.append(profiles / profile.name)
+        places = [path for path in places if path.is_dir()]
         if not places:
             known = ", ".join(sorted(path.name for path in profiles.iterdir()))
             raise UserError(f"{profile}: is no folder and no profile of the package ({known})")

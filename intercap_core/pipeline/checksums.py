@@ -36,8 +36,8 @@ _ROWS = 64  # rows read at a time, so that memory stays flat
 class InputChecksums:
     """Checksums of input files by path, stored in the JSON file ``store``.
 
-    With ``one_look``, sizes and dates are those of the first call for a path. A job does without:
-    files may change while it runs.
+    With ``one_look``, sizes and dates are those of the first call for a path. Jobs do not set it,
+    because files may change while they run.
     """
 
     def __init__(self, store: Path, *, one_look: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Entries of the annotation beside the result."""
+"""Comparison of the annotation's entries with the result."""
 
 from __future__ import annotations
 

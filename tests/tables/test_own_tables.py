@@ -27,7 +27,7 @@ INSTANCE = {"image_id": 0, "category_id": 47, "score": 0.9, "bbox": [1, 1, 9, 9]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two sequences with a common calibration; keypoints lie beside one, candidates apart."""
+    """Two sequences with a common calibration; keypoints are in the folder of one sequence."""
     monkeypatch.chdir(tmp_path)
     root = tmp_path / "captures"
     for name in ("s02_cup_drink", "walk"):

@@ -135,10 +135,10 @@ def test_the_address_restores_camera_layers_and_comparison(shown: Path) -> None:
     assert found["console"] == [] and result["split"] == link.replace("distance", "split")
     joint, truth = (np.reshape(body, (-1, 3)) for body in result["bodies"])
     mean = 1e3 * np.linalg.norm(joint - truth, axis=1).mean()
-    told = re.fullmatch(r"distance to truth, 0 to (\d+) mm; mean ([\d.]+) mm", result["legend"])
-    assert told is not None, result["legend"]
+    legend = re.fullmatch(r"distance to truth, 0 to (\d+) mm; mean ([\d.]+) mm", result["legend"])
+    assert legend is not None, result["legend"]
     assert result["shown"] == [True, False] and result["titles"] == ["joint fit", "truth"]
-    assert float(told[2]) == pytest.approx(mean, rel=0.1) and float(told[1]) > mean
+    assert float(legend[2]) == pytest.approx(mean, rel=0.1) and float(legend[1]) > mean
     eye = _browse(shown, "result.eye = viewer.eye.position.toArray();", "#t=0.20&eye=1,2,3,0,0,1")
     assert eye["result"]["eye"] == pytest.approx([1, 2, 3])
     _browse(shown, "await become(() => viewer.cameras[1].plane.visible);", "#t=0.2&view=k2")
