@@ -2,7 +2,8 @@
 
 The object is often hidden by the hand that carries it, by the head or by the body. A hand may have
 carried it if it leads from the last known pose to the next one. Of all possible paths, the one with
-the highest likelihood of motion and images is used.
+the highest likelihood of motion and images is used. Before the first and after the last known frame
+the object stays in place or in a hand, as it does between the nearest two known frames.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Bridge:
 
 @dataclass(frozen=True)
 class Gap:
-    """Lost frames between two known frames of a track."""
+    """Lost frames between two known frames of a track, or at an end of it."""
 
     mesh: ObjectMesh
     """The object."""
@@ -58,76 +59,83 @@ class Gap:
     """(T,) seconds."""
     joints: np.ndarray | None
     """(T, K, 3) of the person, metres, NaN where unknown."""
+    frames: np.ndarray
+    """(N,) the lost frames."""
     before: int
-    """Known frame before the gap."""
+    """Known frame before the gap; at the start of the track that after it."""
     after: int
-    """Known frame after the gap."""
+    """Known frame after the gap; at the end of the track that before it."""
+    step: tuple[int, int]
+    """Known frames whose motion shows how the object moved: those before and after the gap; at an
+    end of the track the second nearest and the nearest."""
 
     @property
     def seconds(self) -> float:
-        """Time from the known frame before to the one after."""
-        return float(self.times[self.after] - self.times[self.before])
+        """Time from the first to the last of the lost and known frames."""
+        return float(np.ptp(self.times[[*self.frames[[0, -1]], self.before, self.after]]))
 
     def bridges(self) -> list[Bridge]:
         """Return the possible paths: straight, and with each hand that may have held the object."""
-        a, b = self.before, self.after
-        same = self.mesh.symmetry.nearest_equivalent_pose
-        frames = np.arange(a + 1, b)
+        a, b = self.step
         hands = [] if self.joints is None else estimate_hand_motions(self.joints[[a, b]])
-        modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
+        seconds = abs(float(self.times[b] - self.times[a]))
+        modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], seconds, hands)
         rest, free, *in_hand = modes[:, 0, 0]
-        end = same(self.poses[b], self.poses[a])
+        end = self._end(self.poses[a])
         direct = self._straight(end)
-        nothing = np.zeros((len(frames), 6, 6))
-        result = [Bridge(frames, direct, end, float(max(rest, free)), nothing)]
+        nothing = np.zeros((len(self.frames), 6, 6))
+        result = [Bridge(self.frames, direct, end, float(max(rest, free)), nothing)]
         for number, (hand, own) in enumerate(zip(hands, in_hand, strict=True)):
             if hand is None or not np.isfinite(own):
                 continue
-            end = same(self.poses[b], hand.carry(self.poses[a]))
+            end = self._end(hand.carry(self.poses[a]))
             poses, information = direct.copy(), nothing.copy()
-            for i, t in enumerate(frames):
-                pose = self._in_hand(number, int(t), end)
-                if pose is not None:
-                    poses[i], information[i] = pose, self._hand_information(int(t))
+            for i, t in enumerate(self.frames):
+                found = self._in_hand(number, int(t), end)
+                if found is not None:
+                    poses[i], information[i] = found
             if information.any():
-                result.append(Bridge(frames, poses, end, float(own), information))
+                result.append(Bridge(self.frames, poses, end, float(own), information))
         return result
+
+    def _end(self, expected: np.ndarray) -> np.ndarray:
+        """Return the pose of the known frame after the gap, as equivalent nearest to another."""
+        pose = self.poses[self.after]
+        if self.before == self.after:
+            return pose
+        return self.mesh.symmetry.nearest_equivalent_pose(pose, expected)
 
     def _straight(self, end: np.ndarray) -> np.ndarray:
         """Return poses (N, 4, 4) by the shortest turn and the straight line to ``end`` (4, 4)."""
-        ends, last = np.stack([self.poses[self.before], end]), self.after - self.before
-        frames = np.arange(1, last)
-        turns = Slerp([0, last], Rotation.from_matrix(ends[:, :3, :3]))(frames).as_matrix()
-        line = [np.interp(frames, [0, last], ends[:, k, 3]) for k in range(3)]
+        if self.before == self.after:
+            return np.repeat(end[None], len(self.frames), axis=0)
+        ends, known = np.stack([self.poses[self.before], end]), [self.before, self.after]
+        turns = Slerp(known, Rotation.from_matrix(ends[:, :3, :3]))(self.frames).as_matrix()
+        line = [np.interp(self.frames, known, ends[:, k, 3]) for k in range(3)]
         return rigid(turns, np.stack(line, axis=1))
 
-    def _in_hand(self, hand: int, t: int, end: np.ndarray) -> np.ndarray | None:
-        """Return the pose (4, 4) of frame ``t`` in this hand; None if its motion is unknown.
+    def _in_hand(self, hand: int, t: int, end: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the pose (4, 4) of frame ``t`` in this hand and its inverse covariance (6, 6).
 
         The hand carries the pose before the gap forwards, and ``end`` (4, 4), the pose after the
-        gap, backwards. The result is interpolated between the two by time.
+        gap, backwards. The result is interpolated between the two by time. Its standard deviations
+        grow with the time to the nearer known frame, and with the distance from the wrist. None if
+        the motion of the hand is unknown.
         """
         assert self.joints is not None
-        carried = []
-        for u, pose in ((self.before, self.poses[self.before]), (self.after, end)):
-            motion = estimate_hand_motions(self.joints[[u, t]])[hand]
-            if motion is None:
-                return None
-            carried.append(motion.carry(pose))
-        share = (self.times[t] - self.times[self.before]) / self.seconds
-        return apply_step(carried[0], share * step_between(*carried))
-
-    def _hand_information(self, t: int) -> np.ndarray:
-        """Return the inverse covariance (6, 6) of the pose of frame ``t`` in a hand.
-
-        Its standard deviations grow with the time to the nearer known frame.
-        """
-        nearer = min(
-            self.times[t] - self.times[self.before], self.times[self.after] - self.times[t]
+        forwards, backwards = (
+            estimate_hand_motions(self.joints[[u, t]])[hand] for u in (self.before, self.after)
         )
+        if forwards is None or backwards is None:
+            return None
+        carried = [forwards.carry(self.poses[self.before]), backwards.carry(end)]
+        share = (self.times[t] - self.times[self.before]) / self.seconds
+        pose = apply_step(carried[0], share * step_between(*carried))
+        nearer = np.abs(self.times[[self.before, self.after]] - self.times[t]).min()
         turn = np.hypot(SAME_POSE_RAD, HELD_RAD_S * nearer)
-        shift = np.hypot(SAME_POSE_M, HELD_M_S * nearer)
-        return np.diag(np.repeat([turn, shift], 3) ** -2.0)
+        arm = np.linalg.norm(self.mesh.centre_at(pose) - forwards.end)
+        shift = np.linalg.norm([SAME_POSE_M, HELD_M_S * nearer, arm * turn])
+        return pose, np.diag(np.repeat([turn, shift], 3) ** -2.0)
 
 
 @dataclass(frozen=True)
@@ -171,12 +179,18 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
     track = unwrap_symmetry(symmetry, poses, known)
     hand, images = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     pull, sure = np.zeros((count, 6)), np.zeros(count, bool)
-    for a, b in pairwise(np.flatnonzero(known).tolist()):
+    ends = np.flatnonzero(known).tolist()
+    if ends:
+        track[: ends[0]], track[ends[-1] + 1 :] = track[ends[0]], track[ends[-1]]
+    for a, b in pairwise([-1, *ends, count] if len(ends) > 1 else []):
         if b == a + 1:
             continue
-        gap = Gap(observer.mesh, track, times, observer.joints, a, b)
+        frames = np.arange(a + 1, b)
+        step = (ends[1], b) if a < 0 else (ends[-2], a) if b == count else (a, b)
+        a, b = step if step == (a, b) else (step[1], step[1])
+        gap = Gap(observer.mesh, track, times, observer.joints, frames, a, b, step)
         path, fits, is_sure = _choose_path(observer, gap.bridges())
-        track[a + 1 : b] = [fit.pose for fit in fits] if fits else path.poses
+        track[frames] = [fit.pose for fit in fits] if fits else path.poses
         track[b] = path.end
         track[b:] = unwrap_symmetry(symmetry, track[b:], known[b:])
         in_hand = np.any(path.information, axis=(1, 2))
@@ -186,9 +200,6 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
                 images[t] = np.linalg.inv(fits[i].covariance) - path.information[i]
                 pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
         sure[path.frames] = in_hand & (is_sure and gap.seconds < UNSEEN_S)
-    first, last = np.flatnonzero(known)[[0, -1]] if known.any() else (0, count - 1)
-    # before the first and after the last known frame the pose stays as there
-    track[:first], track[last + 1 :] = track[first], track[last]
     return FilledTrack(track, hand, images, pull, sure)
 
 

@@ -193,9 +193,18 @@ class WholeTrack:
         # filled in again, with the annotated poses as evidence.
         lost |= np.isfinite(seconds_since(annotated, decided < SEEN_LOG_RATIO, self._times))
         lost[annotated] = False
-        smoothed = self._smooth(fits, lost, given)
         gone = np.array([frame.gone for frame in frames])
-        status = self._decide_status(smoothed, decided, gone)
+        while True:
+            smoothed = self._smooth(fits, lost, given)
+            status = self._decide_status(smoothed, decided, gone)
+            found = lost & (status == FrameStatus.SEEN)
+            if not found.any():
+                break
+            # the images support poses that were filled in: the frames between can be filled better
+            for t in np.flatnonzero(found).tolist():
+                fits[t] = smoothed.fits[t]
+                decided[t] = fits[t].log_ratio
+            lost &= ~found
         ambiguous = status == FrameStatus.CARRIED
         ambiguous[annotated] = False
         unseen = status >= FrameStatus.CARRIED
