@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import cycle
 
 import cv2
 import numpy as np
@@ -87,8 +88,7 @@ def test_baseline_is_metres_from_depth_to_colour():
     assert read(make_calibration(), depth_mode=None).depth is None
 
 
-@pytest.mark.parametrize("colour_mode", COLOUR_MODES)
-@pytest.mark.parametrize("depth_mode", DEPTH_MODES)
+@pytest.mark.parametrize(("colour_mode", "depth_mode"), zip(COLOUR_MODES, cycle(DEPTH_MODES)))
 def test_real_lenses_project_as_opencv_and_invert(real_calibration, colour_mode, depth_mode):
     camera = read(real_calibration, colour_mode, depth_mode)
     for lens in (camera.colour, camera.depth):

@@ -43,13 +43,11 @@ def apart(people: np.ndarray, places: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("kind", "options"),
-    [("simcc", {}), ("simcc", {"size": (288, 384)}), ("simcc", {"batch": 1}),
-     ("simcc", {"batch": 3}), ("simcc", {"names": ("simcc_y", "simcc_x")}),
-     ("simcc", {"names": ("x", "y")}),
-     ("simcc", {"gain": 5.0}), ("simcc", {"split": (1, 1)}),
-     ("heatmaps", {}), ("heatmaps", {"size": (288, 384)}), ("heatmaps", {"batch": 1}),
-     ("heatmaps", {"batch": 3}), ("heatmaps", {"grid": "udp"}), ("heatmaps", {"gain": 5.0}),
-     ("heatmaps", {"stride": (2, 2)})],
+    [("simcc", {}), ("simcc", {"size": (288, 384), "batch": 3}),
+     ("simcc", {"names": ("simcc_y", "simcc_x"), "gain": 5.0}),
+     ("simcc", {"names": ("x", "y"), "split": (1, 1), "batch": 1}),
+     ("heatmaps", {}), ("heatmaps", {"size": (288, 384), "batch": 3}),
+     ("heatmaps", {"grid": "udp", "gain": 5.0, "batch": 1}), ("heatmaps", {"stride": (2, 2)})],
 )  # fmt: skip
 def test_people_in_their_boxes(tmp_path, kind, options):
     image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
@@ -72,9 +70,11 @@ def test_the_wrong_heatmap_grid_shifts_points_by_half_a_cell(tmp_path):
         assert 2.0 < apart(PoseModel.load(settings).find(image, [around(LEFT)]), LEFT) < 4.5
 
 
-@pytest.mark.parametrize("kind", ["simcc", "heatmaps"])
-@pytest.mark.parametrize("places", [LEFT, RIGHT, tiny_pose.person((115, 20), 330)])
-def test_without_boxes_the_whole_image_is_searched(tmp_path, places, kind):
+@pytest.mark.parametrize(
+    ("kind", "places"),
+    [("simcc", LEFT), ("heatmaps", RIGHT), ("simcc", tiny_pose.person((115, 20), 330))],
+)
+def test_without_boxes_the_whole_image_is_searched(tmp_path, kind, places):
     image = tiny_pose.picture(SIZE, [places])
     people = model(tmp_path, kind).find(image, [around(places, "chair")])
     assert apart(people, places) < 1.6
