@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.annotate.served import copied, small_project
+from intercap_core.annotate.opened import Opened
+from intercap_core.project import load_project
+from tests.annotate.served import NAME, copied, small_project
 from tests.helpers.shared_folder import shared_folder
 
 
@@ -20,3 +23,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def settings(made: Path, tmp_path: Path) -> Path:
     return copied(made, tmp_path / "project")
+
+
+@pytest.fixture
+def opened(settings: Path) -> Iterator[Opened]:
+    opened = Opened(load_project(settings), NAME)
+    yield opened
+    opened.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.annotate.edits import list_edits
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotation import Annotation
-from intercap_core.project import load_project
-from tests.annotate.served import NAME, artefact
-
-
-@pytest.fixture
-def opened(settings: Path) -> Iterator[Opened]:
-    opened = Opened(load_project(settings), NAME)
-    yield opened
-    opened.close()
+from tests.annotate.served import artefact
 
 
 def _fitted(settings: Path, touching: slice, labels: slice, reason: str = "") -> None:

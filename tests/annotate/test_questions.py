@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -31,13 +30,6 @@ def settings(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         file["lost"][3:6] = True
         file["ambiguous"][...] = False
     return settings
-
-
-@pytest.fixture
-def opened(settings: Path) -> Iterator[Opened]:
-    opened = Opened(load_project(settings), NAME)
-    yield opened
-    opened.close()
 
 
 def test_questions_with_the_largest_effect_come_first(opened: Opened) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import h5py
 import numpy as np
 import pytest
@@ -13,15 +10,7 @@ from intercap_core.annotate import questions, result, sides
 from intercap_core.annotate.opened import Opened
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import unpacked
-from intercap_core.project import load_project
-from tests.annotate.served import NAME, annotation, artefact, detect
-
-
-@pytest.fixture
-def opened(settings: Path) -> Iterator[Opened]:
-    opened = Opened(load_project(settings), NAME)
-    yield opened
-    opened.close()
+from tests.annotate.served import annotation, artefact, detect
 
 
 def _doubtful(opened: Opened) -> list[tuple[int, int, str]]:
