@@ -33,10 +33,15 @@ def _as_text(name: Any) -> Any:
     return str(name) if isinstance(name, int) and not isinstance(name, bool) else name
 
 
-def _not_reserved(name: str) -> str:
-    if name in RESERVED_SEQUENCES:
-        raise ValueError("this name is reserved for a folder of the results; choose another one")
-    return name
+def _not_one_of(names: tuple[str, ...], use: str) -> AfterValidator:
+    """Validator that refuses names that have another use."""
+
+    def check(name: str) -> str:
+        if name in names:
+            raise ValueError(f"this name is reserved for {use}; choose another one")
+        return name
+
+    return AfterValidator(check)
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
@@ -47,13 +52,17 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 RESERVED_SEQUENCES = ("export", "recordings", "site", "tables")  # other folders of the results
 
+RESERVED_OBJECTS = ("person",)  # the class of people in detections and in COCO exports
+
 Vector3 = tuple[float, float, float]
 
 CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
 
 Seconds = Annotated[float, Field(strict=True)]
 
-SequenceName = Annotated[Name, AfterValidator(_not_reserved)]
+SequenceName = Annotated[Name, _not_one_of(RESERVED_SEQUENCES, "a folder of the results")]
+
+ObjectName = Annotated[Name, _not_one_of(RESERVED_OBJECTS, "people in detections and exports")]
 
 Metres = Annotated[float, AfterValidator(_metres)]
 

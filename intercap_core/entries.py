@@ -18,6 +18,7 @@ from intercap_core.config_types import (
     Metres,
     Model,
     Name,
+    ObjectName,
     Position,
     Positive,
     SequenceName,
@@ -110,7 +111,7 @@ class Symmetry(Model):
 class ObjectEntry(Model):
     """One entry of objects.yaml."""
 
-    name: Name
+    name: ObjectName
     """Key of the entry."""
     mesh: Path
     """Watertight mesh in metres (.ply or .obj)."""

@@ -192,17 +192,27 @@ def faults_of_truth(path: Path) -> list[str]:
 def _notes_on_keypoints(
     project: Project, row: SequenceEntry, cameras: list[str], findings: RecordingFindings
 ) -> list[str]:
-    """Notes on cameras without keypoints, and on the first keypoints of the others."""
+    """Notes on cameras without keypoints, and on the first keypoints of the others.
+
+    Adds a fault if no camera has keypoints.
+    """
     settings = project.config.detections
-    has_model = settings.segmentation_model is not None or settings.keypoint_model is not None
-    has_files = row.keypoints is not None or row.candidates is not None or row.layout == "behave"
-    if cameras and not has_files and not has_model:
-        return [
-            "its row names neither keypoints nor candidates, so only the frames can be computed; "
-            "run the detectors and add the columns"
-        ]
     folder, notes = row.keypoints, []
-    if folder is None or not folder.is_dir():
+    if folder is None:
+        there = row.layout == "behave" and any(row.recordings.glob("*/*.color.json"))
+    elif folder.is_dir():
+        there = any(keypoint_files.has_keypoints(folder, name) for name in cameras)
+    else:
+        return []  # a fault already
+    if cameras and not there and settings.keypoint_model is None:
+        findings.faults.append(
+            f"{folder or row.recordings}: no keypoints of {', '.join(cameras)}, and no keypoint "
+            "model is set, so no person can be found; run a keypoint detector on the images and "
+            "name its folder in the column keypoints, or set detections.keypoint_model "
+            "(docs/detectors.md)"
+        )
+        return []
+    if folder is None:
         return []
     for name in cameras:
         if keypoint_files.has_keypoints(folder, name):

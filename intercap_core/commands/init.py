@@ -42,6 +42,8 @@ def write_tables(
             raise UserError(f"{path}: no such folder; correct the path")
     if objects is not None and not objects.is_file():
         raise UserError(f"{objects}: no such file; correct --objects")
+    if objects is not None and sources.meshes is not None:
+        raise UserError("--objects names the meshes already; leave --meshes out")
     if intercap.is_release(root):
         name = _dataset(dataset or "intercap")
         draft = intercap.draft(root, sources, dataset=name, objects=objects)

@@ -50,8 +50,8 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
         root: the folder ``RGBD_Images``, or the one that holds it.
         sources: the other folders of the release.
         dataset: name of the project.
-        objects: objects.yaml to use if the release's meshes are missing; None = that of the
-            package.
+        objects: objects.yaml to use instead of the release's meshes; None = that of the package
+            if there are no meshes.
     """
     images = root / "RGBD_Images" if (root / "RGBD_Images").is_dir() else root
     folders = _sequence_folders(images)
@@ -63,7 +63,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
     calibrations = _calibrations(sources.calibrations, images)
     annotations_root = sources.annotations or _find_folder(images, "configs")
     annotated = find_annotation_folders(annotations_root) if annotations_root else {}
-    meshes = sources.meshes or _find_folder(images, "objs")
+    meshes = None if objects else sources.meshes or _find_folder(images, "objs")
     result = Draft(dataset)
     for key, folder in folders.items():
         row = _row(key, folder, sources)
@@ -232,8 +232,8 @@ def _objects(
     known = known if isinstance(known, dict) else {}
     if meshes is None:
         result.remarks.append(
-            f"objects are those of {objects}, not the release's own: name its meshes with --meshes "
-            "(without them its first poses of objects do not apply and are left out)"
+            f"objects are those of {objects}, not the release's own (--meshes); its first poses of "
+            "objects refer to its own meshes and are left out"
         )
         return objects
     entries: dict[str, dict[str, Any]] = {}

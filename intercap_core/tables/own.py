@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from intercap_core import artefacts
-from intercap_core.config_types import LayoutName
+from intercap_core.config_types import RESERVED_OBJECTS, RESERVED_SEQUENCES, LayoutName
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import calibration_readers
@@ -72,7 +73,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
         )
     result = Draft(dataset)
     used = frozenset(recording.folder for recording in recordings)
-    result.objects = _objects(root, sources.meshes, objects, used)
+    result.objects = objects or _objects(sources.meshes or root, used, result.remarks)
     names = _names(result.objects)
     if not names:
         result.remarks.append(
@@ -83,8 +84,9 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
         f"{FILL_IN} gender (female, male or neutral) and height without shoes in metres (empty = "
         "unknown)"
     )
+    sequences = set(RESERVED_SEQUENCES)
     for recording in recordings:
-        row = _row(root, recording, used, sources)
+        row = _row(root, recording, used, sources, sequences)
         _add_object(row, names)
         subject = _SUBJECT.search(str(row.columns["sequence"]))
         row.columns["subject"] = subject[1].lower() if subject else SUBJECT
@@ -96,6 +98,14 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
 def clean_name(text: str) -> str:
     """The text as the name of a sequence, object or dataset."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", text).lstrip("-")[:80] or "recording"
+
+
+def _unique_name(names: Sequence[str], taken: set[str]) -> str:
+    """The first name that is not taken, or the last one with a number; adds it to ``taken``."""
+    numbered = (f"{names[-1][:76]}_{number}" for number in itertools.count(2))
+    found = next(name for name in itertools.chain(names, numbered) if name not in taken)
+    taken.add(found)
+    return found
 
 
 def find_recordings(folder: Path, depth: int = DEEPEST) -> Iterator[Recording]:
@@ -117,12 +127,17 @@ def _folders(folder: Path) -> list[Path]:
         return []
 
 
-def _row(root: Path, recording: Recording, used: frozenset[Path], sources: Sources) -> Row:
-    """Row of a sequence, without object and subject."""
+def _row(
+    root: Path, recording: Recording, used: frozenset[Path], sources: Sources, taken: set[str]
+) -> Row:
+    """Row of a sequence, without object and subject; adds its name to ``taken``."""
     folder = recording.folder
     parts = folder.relative_to(root).parts or (folder.resolve().name,)
-    name = clean_name("_".join(parts))
+    usual = clean_name("_".join(parts))
+    name = _unique_name([usual], taken)
     row = Row({"sequence": name, "layout": recording.layout, "recordings": folder})
+    if name != usual:
+        row.remarks.append(f"{usual} is the name of another sequence or of a folder of results")
     row.cameras = recording.cameras
     row.columns["calibration"] = _find_calibration(row, root, recording, used)
     for kind in ("keypoints", "candidates"):
@@ -219,20 +234,29 @@ def _find_detections(
 
 
 def _objects(
-    root: Path, meshes: Path | None, objects: Path | None, used: frozenset[Path]
+    folder: Path, used: frozenset[Path], remarks: list[str]
 ) -> Path | dict[str, dict[str, Any]]:
-    """Path of an objects.yaml, or entries for the meshes that are found."""
-    if objects is not None:
-        return objects
-    files = list(_files(meshes or root, used))
+    """Path of the first objects.yaml in ``folder``, or entries for the meshes in it.
+
+    Adds a remark for each mesh whose file name is taken.
+    """
+    files = list(_files(folder, used))
     for path in files:
         if path.name == "objects.yaml":
             return path
     entries: dict[str, dict[str, Any]] = {}
+    taken = set(RESERVED_OBJECTS)
     for path in files:
         if path.suffix.lower() in MESH_SUFFIXES:
-            name = re.sub(r"^\d+[_-](?=.)", "", clean_name(path.stem))
-            entries.setdefault(name, {"mesh": path})
+            usual = re.sub(r"^\d+[_-](?=.)", "", clean_name(path.stem))
+            name = _unique_name([usual, clean_name(f"{path.parent.name}_{usual}")], taken)
+            entries[name] = {"mesh": path}
+            if name != usual:
+                of = entries[usual]["mesh"] if usual in entries else "people in detections"
+                remarks.append(
+                    f"{FILL_IN} {path} is object {name}, because {usual} is the name of {of}; "
+                    "remove the mesh that is not used from objects.yaml, or rename its entry"
+                )
     return entries
 
 

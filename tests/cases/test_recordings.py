@@ -53,7 +53,9 @@ def test_orientation_is_left_aside_with_a_calibration_of_colmap(tmp_path):
 def test_the_size_of_an_upright_video_is_that_as_shown(tmp_path):
     project = open_case("b03", tmp_path)
     found = check(project)
-    assert not found.faults and {images.size for images in found.images.values()} == {(240, 320)}
+    (fault,) = found.faults
+    assert "no keypoints of k1, k2, k3" in fault
+    assert {images.size for images in found.images.values()} == {(240, 320)}
 
 
 def test_depth_as_tiff_is_read(tmp_path):

@@ -175,11 +175,12 @@ def small_project(tmp_path: Path) -> Path:
     (tmp_path / "subjects.tsv").write_text("subject\tgender\ns01\tmale\n")
     (tmp_path / "objects.yaml").write_text("cup: {mesh: cup.ply}\n")
     (tmp_path / "sequences.tsv").write_text(
-        "sequence\tsubject\tobject\trecordings\tcalibration\n"
-        "good\ts01\tcup\trec\trig.json\nbad\ts01\tcup\tnone\tnone.json\n"
-        "empty\ts01\tcup\t.\trig.json\n"
+        "sequence\tsubject\tobject\trecordings\tcalibration\tkeypoints\n"
+        "good\ts01\tcup\trec\trig.json\tpoints\nbad\ts01\tcup\tnone\tnone.json\t\n"
+        "empty\ts01\tcup\t.\trig.json\t\n"
     )
     (tmp_path / "rec").mkdir()
+    (tmp_path / "points" / "k1").mkdir(parents=True)
     record(tmp_path / "rec", 0, range(1))
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
@@ -211,7 +212,8 @@ def test_check_lists_the_faults_of_all_files_in_one_pass(small_project: Path) ->
     (small_project / "subjects.tsv").write_text("subject\tgender\ns01\tmale\ns02\tM\n")
     (small_project / "objects.yaml").write_text("cup: {mesh: cup.ply}\nmug: {}\n")
     with (small_project / "sequences.tsv").open("a") as table:
-        table.write("two\ts02\tcup\trec\trig.json\nthree\ts09\tmug\trec\trig.json\nbad\ts01\n")
+        table.write("two\ts02\tcup\trec\trig.json\tpoints\n")
+        table.write("three\ts09\tmug\trec\trig.json\tpoints\nbad\ts01\n")
     done = intercap("check", "config.yaml", folder=small_project)
     assert done.returncode == 1 and "0 of 3 sequences are ready" in done.stdout
     expected = [
@@ -295,39 +297,45 @@ def test_check_refuses_one_camera_without_depth(inside: Path) -> None:
     assert "only camera k1 is used, and without depth" in str(fault)
 
 
-def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> None:
-    exclude = {"exclude": ["bad", "empty"]}
-    (note,) = check_sequences(load_project(Path("config.yaml"), exclude)).notes
-    assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
+def test_check_refuses_a_sequence_without_keypoints(inside: Path) -> None:
+    def faults() -> list[str]:
+        exclude = {"exclude": ["bad", "empty"]}
+        return [str(f) for f in check_sequences(load_project(Path("config.yaml"), exclude)).faults]
 
+    assert faults() == []
+    (inside / "points" / "k1").rename(inside / "points" / "camera1")
+    (fault,) = faults()
+    assert fault.startswith("sequence 'good': points: no keypoints of k1, and no keypoint model is")
+    table = Path("sequences.tsv")
+    table.write_text(table.read_text().replace("\tpoints\n", "\t\n"))
+    (fault,) = faults()
+    assert fault.startswith("sequence 'good': rec: no keypoints of k1") and "column" in fault
+
+
+def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> None:
     beside = np.eye(4)
     beside[0, 3] = 1.5
     write_rig_file(Path("rig.json"), Extrinsics("k1", {"k1": np.eye(4), "k2": beside}))
-    table = Path("sequences.tsv")
-    head, good, *others = table.read_text().splitlines()
-    lines = [f"{head}\tkeypoints\tcandidates", f"{good}\tpoints\tmasks"]
-    table.write_text("\n".join([*lines, *(f"{line}\t\t" for line in others)]) + "\n")
-    (inside / "points" / "camera1").mkdir(parents=True)
     (inside / "masks").mkdir()
-    missing = [
-        str(note) for note in check_sequences(load_project(Path("config.yaml"), exclude)).notes
-    ]
-    assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
-        "rec records k1", "points has no folder k1 and no k1.json", "masks has no k1.json",
-    ]  # fmt: skip
-    assert "rig.json also has k2" in missing[0]
-    (inside / "points" / "k1").mkdir()
+    assert [
+        text.partition(": ")[2].partition(";")[0] for text in notes_with("candidates", "masks")
+    ] == ["rec records k1", "masks has no k1.json"]
     (inside / "masks" / "k1.json").write_text("[]")
-    assert len(check_sequences(load_project(Path("config.yaml"), exclude)).notes) == 1
     done = intercap("check", "config.yaml", folder=inside)
-    assert "note: sequence 'good': rec records k1" in done.stdout
+    assert done.stdout.count("note: ") == 1
+    assert "note: sequence 'good': rec records k1; rig.json also has k2" in done.stdout
+    record(Path("rec"), 1, range(1))
+    (inside / "masks" / "k2.json").write_text("[]")
+    (note,) = (str(note) for note in check_sequences(load_project(Path("config.yaml"))).notes)
+    assert "points has no folder k2 and no k2.json" in note
 
 
 def notes_with(column: str, folder: str) -> list[str]:
-    """Notes of the good sequence with one more column in its row."""
+    """Notes of the good sequence with another folder in one column of its row."""
     table = Path("sequences.tsv")
     head, good, *_ = table.read_text().splitlines()
-    table.write_text(f"{head}\t{column}\n{good}\t{folder}\n")
+    row = dict(zip(head.split("\t"), good.split("\t"), strict=True)) | {column: folder}
+    table.write_text("\t".join(row) + "\n" + "\t".join(row.values()) + "\n")
     return [str(note) for note in check_sequences(load_project(Path("config.yaml"))).notes]
 
 
@@ -378,7 +386,6 @@ FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
 def test_check_reads_the_first_keypoints(
     inside: Path, name: str, content: object, says: str
 ) -> None:
-    Path("points/k1").mkdir(parents=True)
     text = content if isinstance(content, str) else json.dumps(content)
     Path("points", name).write_text(text)
     notes = [note for note in notes_with("keypoints", "points") if "candidates" not in note]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -21,6 +22,7 @@ from tests.helpers.synthetic_capture import COLOUR, ring
 
 ROOT = Path(__file__).resolve().parents[2]
 LENS = COLOUR.scaled(0.1)
+PEOPLE = json.dumps({"people": [{"pose_keypoints_2d": [10.0, 20.0, 0.9] * 25}]})
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,14 @@ def captures(tmp_path: Path) -> Path:
     for path in write_rig(folder / "c", (LENS.width, LENS.height), 90.0).values():
         (path / "0.jpg").write_bytes(colour(0, 0))
         (path / "1.jpg").write_bytes(colour(1, 0))
+        path = folder / "c" / "recordings" / "keypoints" / path.name
+        path.mkdir(parents=True)
+        (path / "0_keypoints.json").write_text(PEOPLE)
+    first = folder / "a" / "RGBD_Images" / "one" / "keypoints" / "k1"
+    first.mkdir(parents=True)
+    (first / "00000_keypoints.json").write_text(PEOPLE)
+    for place in (folder / "b" / "sequences").glob("*/t1.000"):
+        (place / "k0.color.json").write_text(PEOPLE)
     return folder
 
 

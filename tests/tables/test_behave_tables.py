@@ -54,6 +54,7 @@ def release(tmp_path, monkeypatch) -> Path:
         write_behave(
             root, rig, times=("0001.000", "0002.000"), colour=colour, depth=flat, sequence=sequence
         )
+        (root / "sequences" / sequence / "t0001.000" / "k1.color.json").write_text("{}")
     for number, name in ((10, "stool"), (1, "suitcase")):
         folder = root / "objects" / name
         folder.mkdir(parents=True)

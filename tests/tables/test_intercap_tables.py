@@ -68,6 +68,7 @@ def release(tmp_path, monkeypatch) -> Path:
             root, rig, numbers=numbers, colour=colour, depth=flat, sequence=sequence,
             calibration=calibration,
         )  # fmt: skip
+        (root / "keypoints" / sequence / "k1").mkdir(parents=True)
     annotate(root, "subject01_motion03_seg1", contact="3\n6\n\n10\n400\n\n")
     annotate(root, "subject01_motion03_seg1_v2", contact="2\n5\n")
     annotate(root, "subject03_motion09_seg0", contact="4\n7\n", frame=3)
@@ -99,7 +100,8 @@ def tables(*arguments: str):
 
 
 def write(*arguments: str) -> str:
-    done = tables("InterCap", "--output", "config/intercap", *arguments)
+    given = ("InterCap", "--output", "config/intercap", "--keypoints", "InterCap/keypoints")
+    done = tables(*given, *arguments)
     assert done.exit_code == 0, done.exception or done.output
     return done.output
 
@@ -147,9 +149,11 @@ def test_annotations_count_frame_sets(release):
     assert (Path("config/intercap") / other).is_file() and other in output
 
 
-def test_poses_are_left_out_without_the_releases_meshes(release):
-    shutil.rmtree(release / "objs")
-    output = write()
+@pytest.mark.parametrize("given", [(), ("--objects", str(ROOT / "config/objects.yaml"))])
+def test_poses_are_left_out_without_the_releases_meshes(release, given):
+    if not given:
+        shutil.rmtree(release / "objs")
+    output = write(*given)
     project = load_project(Path("config/intercap/config.yaml"))
     assert project.annotation("s01_o03_seg1").object_pose is None
     assert project.objects["football"].mesh == ROOT / "config/objects/03_football.ply"
@@ -158,7 +162,7 @@ def test_poses_are_left_out_without_the_releases_meshes(release):
 
 def test_detections_are_found_by_usual_names(release, tmp_path):
     for name in ("s01_o03_seg1", "03/09/Seg_0", "subject09_motion03_seg00"):
-        (tmp_path / "kp" / name).mkdir(parents=True)
+        (tmp_path / "kp" / name / "k1").mkdir(parents=True)
     write("--keypoints", "kp")
     project = load_project(Path("config/intercap/config.yaml"))
     found = [row.keypoints for row in project.sequences.values()]
@@ -287,7 +291,9 @@ def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
     choice = choose_calibration(sequence, folders)
     assert choice.best == "third" and choice.residual_m["third"] < 0.7 * choice.residual_m["first"]
     monkeypatch.chdir(tmp_path)
-    done = tables("InterCap", "--output", "out", "--objects", str(ROOT / "config/objects.yaml"))
+    (tmp_path / "kp" / "04/05/Seg_0" / "k1").mkdir(parents=True)
+    objects = str(ROOT / "config/objects.yaml")
+    done = tables("InterCap", "--output", "out", "--objects", objects, "--keypoints", "kp")
     assert done.exit_code == 0
     table = Path("out/sequences.tsv").read_text()
     assert "# the release does not state this calibration; third is the best" in table

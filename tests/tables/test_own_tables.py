@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from intercap_core.cli import app
+from intercap_core.errors import UserError
 from intercap_core.formats.detections.candidate_files import holds_instances
 from intercap_core.formats.detections.coco import HEAD_BYTES
 from intercap_core.formats.detections.keypoint_files import holds_people
@@ -27,7 +28,7 @@ INSTANCE = {"image_id": 0, "category_id": 47, "score": 0.9, "bbox": [1, 1, 9, 9]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two sequences with a common calibration; keypoints are in the folder of one sequence."""
+    """Two sequences with a common calibration; keypoints in one's folder and in a common one."""
     monkeypatch.chdir(tmp_path)
     root = tmp_path / "captures"
     for name in ("s02_cup_drink", "walk"):
@@ -43,10 +44,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (root / "s02_cup_drink" / "rig.json").unlink()
     (root / "walk" / "rig.json").rename(root / "rig.json")
     for camera in CAMERAS:
-        people = root / "s02_cup_drink" / "openpose" / camera
-        people.mkdir(parents=True)
-        for number in range(3):
-            (people / f"{number:03d}_keypoints.json").write_text(json.dumps(PERSON))
+        for place in ("s02_cup_drink/openpose", "keypoints/walk"):
+            people = root / place / camera
+            people.mkdir(parents=True)
+            for number in range(3):
+                (people / f"{number:03d}_keypoints.json").write_text(json.dumps(PERSON))
         results = root / "candidates" / "s02_cup_drink"
         results.mkdir(parents=True, exist_ok=True)
         (results / f"{camera}.json").write_text(json.dumps([INSTANCE]))
@@ -71,7 +73,8 @@ def test_what_can_be_seen_is_written(folder: Path) -> None:
     assert row.calibration == alone.calibration == Path("captures/rig.json")
     assert row.keypoints == Path("captures/s02_cup_drink/openpose")
     assert row.candidates == Path("captures/candidates/s02_cup_drink")
-    assert (alone.object, alone.keypoints, alone.candidates) == (None, None, None)
+    assert alone.keypoints == Path("captures/keypoints/walk")
+    assert (alone.object, alone.candidates) == (None, None)
     assert set(project.objects) == {"cup", "suitcase"}
     assert "2 of 2 sequences are ready to run" in output
 
@@ -92,6 +95,33 @@ def test_what_cannot_be_seen_is_marked_and_has_a_default(folder: Path) -> None:
     table = Path("lab/sequences.tsv").read_text().splitlines()
     assert "FILL IN: the name of the sequence contains no object" in table[-2]
     assert output.count("FILL IN") == 2
+
+
+def test_meshes_and_recordings_of_one_name_get_different_names(folder: Path) -> None:
+    (folder / "scans").mkdir()
+    for name in ("cup", "person"):
+        shutil.copy(folder / "meshes" / "09_cup.ply", folder / "scans" / f"{name}.ply")
+    shutil.copytree(folder / "walk", folder / "s02 cup drink")
+    (folder / "walk").rename(folder / "recordings")
+    shutil.rmtree(folder / "keypoints")
+    done = CliRunner().invoke(app, ["init", "captures", "--output", "lab"])
+    project = load_project(Path("lab/config.yaml"))
+    places = {name: entry.mesh.parent.name for name, entry in project.objects.items()}
+    assert places == {
+        "cup": "meshes", "suitcase": "meshes", "scans_cup": "scans", "scans_person": "scans"
+    }  # fmt: skip
+    folders = {name: row.recordings.name for name, row in project.sequences.items()}
+    assert folders == {
+        "recordings_2": "recordings",
+        "s02_cup_drink": "s02 cup drink",
+        "s02_cup_drink_2": "s02_cup_drink",
+    }
+    assert "scans/cup.ply is object scans_cup, because cup is the name of" in done.output
+    assert "person is the name of people in detections" in done.output
+    assert "recordings_2: recordings is the name of another sequence or of a folder" in done.output
+    Path("lab/objects.yaml").write_text("person: {mesh: ../captures/scans/person.ply}\n")
+    with pytest.raises(UserError, match=r"'person'.*reserved for people in detections"):
+        load_project(Path("lab/config.yaml"))
 
 
 def test_an_object_that_nothing_shows_is_noted(folder: Path) -> None:
