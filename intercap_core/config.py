@@ -250,7 +250,10 @@ class ExportSettings(Model):
     masks: bool = True
     """Render object masks and boxes for bop, with and without occlusion by the body."""
     images: bool = False
-    """Copy the recorded colour images, with lens distortion, into bop and coco."""
+    """Write the colour images into bop and coco, and depth of the same pixels into bop."""
+    undistort: bool = False
+    """Write these images resampled to a pinhole; masks, boxes and keypoints of bop and coco are
+    those of the resampled images."""
 
 
 class CardSettings(Model):

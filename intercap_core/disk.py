@@ -1,4 +1,4 @@
-"""Disks that are full, over a quota or not writable: finding and describing these faults.
+"""Links between files, and faults of disks that are full, over a quota or not writable.
 
 HDF5 crashes the process if it cannot write its buffers. :class:`PartFile` hides failed writes from
 HDF5 and reports them afterwards.
@@ -132,6 +132,19 @@ def free_bytes(place: Path) -> int:
     """Free space on the disk of a path, which need not exist yet."""
     there = next(one for one in (place, *place.resolve().parents) if one.exists())
     return shutil.disk_usage(there).free
+
+
+def link(file: Path, target: Path) -> None:
+    """Create ``target`` as a hard link to ``file``, or as a copy if the file system has no links.
+
+    Raises FileNotFoundError if ``file`` is missing.
+    """
+    try:
+        os.link(file, target)
+    except FileNotFoundError:
+        raise
+    except OSError:  # no links, or no more of them
+        shutil.copyfile(file, target)
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

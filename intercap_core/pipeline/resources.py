@@ -24,6 +24,9 @@ TIME_MARGIN = 5.0  # a busy node, a slow file system
 LEAST_MINUTES = 10  # added to every request
 CUDA_MB = 3000.0  # memory of the driver and the libraries in a process that uses a GPU
 MODEL_MB, MODEL_SECONDS = 3000.0, 2.0  # memory of a detector; time of an image on 8 cores
+# Images in an export (settings export.images and undistort): measured for 1080p colour and a
+# separate depth camera of 640x576
+IMAGES_MB, IMAGES_SECONDS = 300.0, 0.3
 READ_MB_PER_SECOND = 40.0  # reading and decoding on one core: half of the measured rate
 
 # Extent assumed before a recording has been read; only dry runs show requests made from it.
@@ -63,8 +66,7 @@ def memory_mb(project: Project, rule: str, extent: Extent, attempt: int = 1) -> 
     needed = JOBS[rule].memory_mb(extent) * MEMORY_MARGIN + SNAKEMAKE_MB
     if on_gpu(project, rule):
         needed += CUDA_MB
-    if rule == "detections" and has_model(project):
-        needed += MODEL_MB
+    needed += _added(project, rule)[0]
     return attempt * round(needed * _scale(project.config.cluster.memory_scale, rule))
 
 
@@ -77,10 +79,18 @@ def minutes(
         read_mb: megabytes of recordings that the job reads.
     """
     seconds = JOBS[rule].time_s(extent) + read_mb / READ_MB_PER_SECOND
-    if rule == "detections" and has_model(project):
-        seconds += MODEL_SECONDS * extent.images
+    seconds += _added(project, rule)[1] * extent.images
     requested = LEAST_MINUTES + seconds * TIME_MARGIN / 60
     return attempt * round(requested * _scale(project.config.cluster.time_scale, rule))
+
+
+def _added(project: Project, rule: str) -> tuple[float, float]:
+    """Megabytes, and seconds per image, that settings add to a rule."""
+    if rule == "detections" and has_model(project):
+        return MODEL_MB, MODEL_SECONDS
+    if rule == "export" and (project.config.export.images or project.config.export.undistort):
+        return IMAGES_MB, IMAGES_SECONDS
+    return 0.0, 0.0
 
 
 def has_model(project: Project) -> bool:

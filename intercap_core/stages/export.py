@@ -19,7 +19,16 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export import body_files, bop, coco, contact, glb, meshes, parameters
+from intercap_core.output.export import (
+    body_files,
+    bop,
+    coco,
+    contact,
+    glb,
+    images,
+    meshes,
+    parameters,
+)
 from intercap_core.output.export.about import About, Deviations, ExportBody, Verdict
 from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.contact import ContactVertices, StatedContact
@@ -76,8 +85,14 @@ def run(
     about = _about(paths, motion, mesh)
     posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
     bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
-    scenes = Scenes(motion, rig, mesh, image_of, times, time_offset, bodies)
+    exported = images.undistorted(rig) if settings.undistort else rig
+    scenes = Scenes(motion, exported, mesh, image_of, times, time_offset, bodies)
     output.mkdir(parents=True)
+    if set(formats) & _IMAGE_FORMATS:
+        with Frames.open(paths.frames) as frames:
+            names = images.name_images(frames, scenes)
+            if settings.images or settings.undistort:
+                images.write(output, frames, rig, scenes, names, formats)
     for name in formats:
         if name == "intercap":
             (output / "intercap").mkdir()
@@ -88,7 +103,7 @@ def run(
             number = bop.object_id(models.object_.mesh)
             bop.write(output / "bop", scenes, number, about, masks=settings.masks)
         elif name == "coco":
-            coco.write(output / "coco" / "annotations.json", scenes, about)
+            coco.write(output / "coco" / "annotations.json", scenes, about, names)
         elif name == "contact" and about.contact is not None and about.touching is not None:
             contact.write(output / "contact", about.contact, about.touching)
         elif name == "meshes":
@@ -104,18 +119,16 @@ def run(
     files: Sequence[WrittenBody] = ()
     if set(formats) & _BODY_FORMATS:
         files = body_files.write(output / "body", about.body)
-    if settings.images and set(formats) & _IMAGE_FORMATS:
-        _copy_images(output, paths.frames, scenes, formats)
     if about.verdict.stated:
         summary = {"sequence": motion.sequence, **about.verdict.summary()}
         _dump(output / "verdict.json", summary)
-    text = readme(motion, viewed, mesh, requested, about, files, kind=settings.mesh_format)
+    text = readme(motion, viewed, mesh, requested, about, files, settings)
     (output / "README.txt").write_text(text, encoding="utf-8")
     coordinates = {
         **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
         "intercap": Coordinates.of(motion),
         "bop": Coordinates.of(motion, bop.UNITS),
-        "coco": Coordinates.of(motion, coco.UNITS),
+        "coco": Coordinates.of(motion, coco.units(scenes)),
         "glb": glb.coordinates(viewed, z_up=z_up),
         "contact": Coordinates(_NO_FRAME, np.full(3, np.nan)),
     }
@@ -144,24 +157,6 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
         None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
         motion.made_by,
     )
-
-
-def _copy_images(folder: Path, frames: Path, scenes: Scenes, formats: Sequence[str]) -> None:
-    """Copy the recorded colour images of all frames to the folders of the image formats."""
-    with Frames.open(frames) as recorded:
-        for c, camera in enumerate(scenes.rig):
-            for image in sorted(scenes.frames_of(c)):
-                packet = recorded.colour_jpeg(image, c)
-                if packet is None:
-                    continue
-                kind = "png" if packet.startswith(b"\x89PNG") else "jpg"
-                places = {
-                    "bop": folder / "bop" / "scenes" / f"{c:06d}" / "rgb",
-                    "coco": folder / "coco" / camera.name,
-                }
-                for name in places.keys() & set(formats):
-                    places[name].mkdir(exist_ok=True)
-                    (places[name] / f"{image:06d}.{kind}").write_bytes(packet)
 
 
 def _write_manifest(

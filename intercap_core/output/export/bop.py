@@ -19,7 +19,7 @@ from intercap_core.output.export.meshes import ply
 from intercap_core.output.export.motion import Coordinates
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
-SCENES = "scenes"  # folder of the scenes
+SPLIT = "test"  # folder of the scenes: in BOP, images whose poses are known
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
 
 
@@ -29,11 +29,17 @@ def object_id(mesh_path: Path) -> int:
     return max(1, int(number.group())) if number else 1
 
 
+def scene_folder(folder: Path, number: int) -> Path:
+    """Return the folder of the scene of the rig's camera ``number``."""
+    return folder / SPLIT / f"{number:06d}"
+
+
 def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: bool) -> None:
     """Write ``models/``, one scene folder per camera in the rig's order, and the targets.
 
     An image has the number of its frame set. The image of a delayed camera shows an earlier frame,
-    which ``scene_about.json`` names. Poses are those at the image's own exposure.
+    which ``scene_about.json`` names. Poses are those at the image's own exposure. Depth images that
+    a scene folder already has determine the pixels with valid depth.
 
     Args:
         obj_id: number of the object's model.
@@ -45,18 +51,12 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
     lenses: dict[str, Any] = {}
     targets = []
     for number, camera in enumerate(scenes.rig):
-        scene = folder / SCENES / f"{number:06d}"
-        scene.mkdir(parents=True)
+        scene = scene_folder(folder, number)
+        scene.mkdir(parents=True, exist_ok=True)
         poses = scenes.poses[number]
         _dump(scene / "scene_camera.json", scene_camera(camera, list(poses)))
         _dump(scene / "scene_gt.json", scene_gt(camera, poses, obj_id))
-        lens = camera.colour
-        lenses[f"{number:06d}"] = {
-            "camera": camera.name,
-            "width": lens.width,
-            "height": lens.height,
-            "distortion_k1_k2_p1_p2_k3_k4_k5_k6": lens.distortion.tolist(),
-        }
+        lenses[scene.name] = {"camera": camera.name, **scenes.lens_of(number)}
         if number == 0:
             _dump(folder / "camera.json", _camera(camera))
         info: dict[str, Any] = {}
@@ -109,11 +109,14 @@ def _write_masks(scene: Path, drawn: Silhouettes, camera: Camera) -> dict[str, A
         path = scene / name / f"{drawn.image:06d}_000000.png"
         path.write_bytes(cv2.imencode(".png", mask.image(camera))[1].tobytes())
     whole, visible = drawn.whole_object.area, drawn.object_.area
+    valid, file = whole, scene / "depth" / f"{drawn.image:06d}.png"
+    if file.is_file() and (depth := cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) is not None:
+        valid = int(np.count_nonzero(depth[drawn.whole_object.image(camera) > 0]))
     return {
         "bbox_obj": drawn.whole_object.box(),
         "bbox_visib": drawn.object_.box(),
         "px_count_all": whole,
-        "px_count_valid": whole,
+        "px_count_valid": valid,
         "px_count_visib": visible,
         "visib_fract": visible / whole if whole else 0.0,
     }

@@ -1,9 +1,9 @@
-"""Masks, boxes and keypoints of person and object in every recorded image, in COCO's format."""
+"""Masks, boxes and keypoints of person and object in every colour image, in COCO's format."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,22 +29,31 @@ _SKELETON = [
     [16, 14], [14, 12], [17, 15], [15, 13], [12, 13], [6, 12], [7, 13], [6, 7], [6, 8], [7, 9],
     [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
 ]  # fmt: skip
-UNITS = "pixels of the images as recorded, x right and y down, seconds"
 
 
-def write(path: Path, scenes: Scenes, about: About) -> None:
-    """Write the annotations of all images to ``path``.
+def units(scenes: Scenes) -> str:
+    """Return the units of all numbers, in words."""
+    images = "undistorted images" if scenes.undistorted else "images as recorded"
+    return f"pixels of the {images}, x right and y down, seconds"
 
-    Image files are named <camera>/<number>.jpg, whether or not they are exported.
+
+def write(path: Path, scenes: Scenes, about: About, names: Sequence[Mapping[int, str]]) -> None:
+    """Write the annotations of all colour images to ``path``.
+
+    Args:
+        names: for each camera, names of the recorded images by number. In the file they are in a
+            folder named as the camera, whether or not the images are exported.
     """
     keypoints = _keypoints(scenes.motion)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for number, camera in enumerate(scenes.rig):
         for drawn in scenes.draw(number):
+            if drawn.image not in names[number]:
+                continue  # only depth was recorded
             image = {
                 "id": len(images) + 1,
-                "file_name": f"{camera.name}/{drawn.image:06d}.jpg",
+                "file_name": f"{camera.name}/{names[number][drawn.image]}",
                 "width": camera.colour.width,
                 "height": camera.colour.height,
                 "camera": camera.name,
@@ -63,7 +72,8 @@ def write(path: Path, scenes: Scenes, about: About) -> None:
     content = {
         "info": {
             "description": scenes.motion.sequence,
-            **about.to_json(Coordinates.of(scenes.motion, UNITS)),
+            "lenses": {camera.name: scenes.lens_of(n) for n, camera in enumerate(scenes.rig)},
+            **about.to_json(Coordinates.of(scenes.motion, units(scenes))),
         },
         "images": images,
         "annotations": annotations,

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from intercap_core import artefacts
+from intercap_core.disk import link
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.output.export.bop import SCENES, object_id
+from intercap_core.output.export.bop import SPLIT, object_id
 from intercap_core.stage_list import STAGES
-
-SPLIT = "test"  # of BOP: images whose poses are known
 
 _README = """\
 {dataset}: exports of {count} sequences as one
@@ -164,7 +163,7 @@ def _merge_bop(folder: Path, exports: Mapping[str, Path], numbers: Mapping[str, 
         for scene, lens in _load(own / "lenses.json").items():
             merged = f"{before + int(scene):06d}"
             scenes[merged] = {"sequence": name, **lens}
-            _merge_scene(own / SCENES / scene, folder / SPLIT / merged, number)
+            _merge_scene(own / SPLIT / scene, folder / SPLIT / merged, number)
         targets += [
             {**target, "scene_id": before + target["scene_id"], "obj_id": number}
             for target in _load(own / "test_targets_bop19.json")
@@ -197,11 +196,9 @@ def _merge_scene(own: Path, merged: Path, number: int) -> None:
 def _link(file: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.link(file, target)
+        link(file, target)
     except FileNotFoundError:
         raise UserError(f"{file}: is missing; re-run stage 'export'") from None
-    except OSError:  # the file system has no links, or no more of them
-        shutil.copyfile(file, target)
 
 
 def _load(path: Path) -> Any:

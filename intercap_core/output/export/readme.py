@@ -8,6 +8,7 @@ from pathlib import Path
 import jinja2
 
 from intercap_core.body.maps import maps_path
+from intercap_core.config import ExportSettings
 from intercap_core.evaluation.verdict.figures import StatedError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import DEVIATIONS_SOURCE, About
@@ -25,8 +26,7 @@ def readme(
     formats: Sequence[str],
     about: About,
     files: Sequence[WrittenBody],
-    *,
-    kind: str,
+    settings: ExportSettings,
 ) -> str:
     """Compose README.txt.
 
@@ -36,7 +36,6 @@ def readme(
         mesh: None without an object; the formats that need one are then omitted.
         formats: formats that the settings list.
         files: written body files.
-        kind: file format of meshes.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "data"),
@@ -53,7 +52,9 @@ def readme(
         formats=formats,
         about=about,
         files=files,
-        kind=kind,
+        kind=settings.mesh_format,
+        images=settings.images or settings.undistort,
+        undistorted=settings.undistort,
         body_file=f"{about.body.path.name}, digest {about.body.to_json()['body_file_digest']}",
         stated_errors=_stated_errors(about.verdict.stated),
         up=Coordinates.of(viewed).header_lines()[1],

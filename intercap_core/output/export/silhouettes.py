@@ -1,6 +1,7 @@
-"""Silhouettes of body and object in the recorded images, with mutual occlusion.
+"""Silhouettes of body and object in the images of a rig, with mutual occlusion.
 
-They are rendered through each camera's own lens and match the distorted images as recorded.
+They are rendered through the lens of each image: with distortion for images as recorded, and by a
+pinhole for undistorted images.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -85,6 +87,7 @@ class Scenes:
     motion: Motion
     """The motion, in the master camera's frame."""
     rig: Rig
+    """The cameras, with the lenses of the exported images."""
     mesh: ObjectMesh | None
     """None without an object."""
     image_of: np.ndarray
@@ -111,6 +114,21 @@ class Scenes:
             exposed = apply_step(poses, self.time_offset[number] * twist)
             result.append({i: exposed[t] for i, t in sorted(self.frames_of(number).items())})
         return result
+
+    def lens_of(self, number: int) -> dict[str, Any]:
+        """Return size, pinhole matrix (9,) row by row and distortion (8,) of a camera for JSON."""
+        lens = self.rig[number].colour
+        return {
+            "width": lens.width,
+            "height": lens.height,
+            "cam_K": lens.matrix.ravel().tolist(),
+            "distortion_k1_k2_p1_p2_k3_k4_k5_k6": lens.distortion.tolist(),
+        }
+
+    @property
+    def undistorted(self) -> bool:
+        """Whether the lenses of all images are pinholes."""
+        return not any(camera.colour.distortion.any() for camera in self.rig)
 
     def frames_of(self, number: int) -> dict[int, int]:
         """Map the image numbers of a camera to the frames that they show."""

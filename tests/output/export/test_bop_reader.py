@@ -39,7 +39,7 @@ def _load(path: Path) -> Any:
 def _images(folder: Path) -> Iterator[Image]:
     lenses = _load(folder / "lenses.json")
     models: dict[int, trimesh.Trimesh] = {}
-    for scene in sorted((folder / "scenes").iterdir()):
+    for scene in sorted((folder / "test").iterdir()):
         cameras, gt, info = (
             _load(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
         )
@@ -129,7 +129,7 @@ def test_info_is_that_of_the_masks(everything: Path, occluded: list[Image]) -> N
         assert image.info["visib_fract"] == pytest.approx(counts[1] / counts[0])
         box = cv2.boundingRect(image.mask.astype(np.uint8))
         assert box == tuple(image.info["bbox_obj"])
-    first = _load(everything / "bop" / "scenes" / "000000" / "scene_camera.json")["0"]
+    first = _load(everything / "bop" / "test" / "000000" / "scene_camera.json")["0"]
     assert _load(everything / "bop" / "camera.json")["fx"] == first["cam_K"][0]
 
 
@@ -145,7 +145,7 @@ def test_targets_are_images_in_which_it_is_seen(turning: Path, images: list[Imag
     targets = _load(turning / "test_targets_bop19.json")
     assert len(targets) == sum(image.info["visib_fract"] >= 0.1 for image in images)
     for target in targets:
-        scene = turning / "scenes" / f"{target['scene_id']:06d}"
+        scene = turning / "test" / f"{target['scene_id']:06d}"
         entries = _load(scene / "scene_gt.json")[str(target["im_id"])]
         ours = [entry for entry in entries if entry["obj_id"] == target["obj_id"]]
         assert len(ours) == target["inst_count"]
@@ -154,7 +154,7 @@ def test_targets_are_images_in_which_it_is_seen(turning: Path, images: list[Imag
 def test_all_scenes_share_the_world_frame(turning: Path) -> None:
     """The object's pose in the world, by the cameras of any scene, is the same in one frame."""
     places: dict[str, list[np.ndarray]] = {}
-    for scene in sorted((turning / "scenes").iterdir()):
+    for scene in sorted((turning / "test").iterdir()):
         cameras, gt = (_load(scene / f"scene_{name}.json") for name in ("camera", "gt"))
         for image, (entry,) in gt.items():
             camera = cameras[image]

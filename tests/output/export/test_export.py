@@ -12,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -21,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.loading import OPEN_BODY
-from intercap_core.config import ExportSettings
 from intercap_core.entries import Symmetry
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.masks import decode
@@ -89,7 +87,10 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
     image_of = images_of_moments(slip, np.ones((total, 3), bool))
     scenes = Scenes(motion, capture.rig, capture.mesh, image_of, times, late, np.zeros((0, 0, 3)))
     bop.write(tmp_path / "bop", scenes, 9, exported.plain_about(motion), masks=False)
-    path = tmp_path / "bop" / "scenes" / "000001"
+    path = tmp_path / "bop" / "test" / "000001"
+    assert sorted(file.name for file in path.iterdir()) == [
+        f"scene_{kind}.json" for kind in ("about", "camera", "gt")
+    ]
     entries = json.loads((path / "scene_gt.json").read_text())
     assert sorted(entries) == sorted(json.loads((path / "scene_camera.json").read_text()))
     assert list(entries) == ["0", "1", "3"], "the image of set 2 repeats what that of set 1 is"
@@ -139,21 +140,6 @@ def test_coco_is_read_by_its_own_library(capture: fitted.Capture, everything: Pa
     points = np.reshape(first["keypoints"], (17, 3))
     joints = capture.model.forward(capture.model.zeros(1)).joints  # order of sides is the model's
     assert joints.shape[1] == 55 and (points[shoulders, 2] > 0).any()
-
-
-def test_images_are_exported_on_request(
-    capture: fitted.Capture, everything: Path, tmp_path: Path
-) -> None:
-    assert not list(everything.rglob("*.jpg"))
-    out = exported.run(capture, tmp_path / "out", formats=("bop", "coco"), images=True, masks=False)
-    read = COCO(str(out / "coco" / "annotations.json"))
-    for image in read.loadImgs(read.getImgIds()):
-        picture = cv2.imread(str(out / "coco" / image["file_name"]))
-        assert picture.shape[:2] == (image["height"], image["width"])
-    assert len(list((out / "bop").rglob("rgb/*.jpg"))) == 3 * len(capture.vertices)
-    assert not list(out.rglob("mask/*")) and not list(out.rglob("scene_gt_info.json"))
-    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["bop", "coco"]
-    assert "meshes" not in ExportSettings().formats
 
 
 def test_the_bop_model_has_size_and_symmetries(capture: fitted.Capture, everything: Path) -> None:

@@ -191,7 +191,7 @@ def test_bop_images_name_their_frame(capture: fitted.Capture, everything: Path) 
         flags = Flags.read(measured)
     assert flags.at(0) == {"flagged": ["object", "contact"], "flag_reason": fitted.LOST}
     for number, camera in enumerate(capture.rig):
-        scene = everything / "bop" / "scenes" / f"{number:06d}"
+        scene = everything / "bop" / "test" / f"{number:06d}"
         content = json.loads((scene / "scene_about.json").read_text())
         assert content["camera"] == camera.name
         assert content["images"].keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
