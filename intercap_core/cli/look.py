@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from intercap_core.cli.options import (
-    DEFAULT_SETTINGS,
     Cores,
     Settings,
+    SettingsOrDefault,
     find_sequence,
     open_project,
     prepare,
@@ -58,7 +58,7 @@ def inspect(
 
 @app.command()
 def annotate(
-    settings: Settings = DEFAULT_SETTINGS,
+    settings: SettingsOrDefault,
     sequence: Annotated[
         str | None, typer.Argument(help="A sequence; without it, a list of all, worst first.")
     ] = None,
@@ -84,7 +84,7 @@ def annotate(
     (ssh -L PORT:127.0.0.1:PORT HOST) and use the same URL. docs/annotate.md is a five-minute
     introduction.
 
-    Examples: intercap annotate cup_drink_s02 (of config/config.yaml);
+    Examples: intercap annotate cup_drink_s02 (of the project in this folder);
     intercap annotate config/demo/config.yaml;
     intercap annotate config/lab/config.yaml cup_drink_s02 --port 8123 --by ann
     """
@@ -101,7 +101,7 @@ def annotate(
 
 @app.command()
 def view(
-    settings: Settings = DEFAULT_SETTINGS,
+    settings: SettingsOrDefault,
     sequence: Annotated[str | None, typer.Argument(help="A sequence of the project.")] = None,
     output: Annotated[
         Path | None, typer.Option(help="Folder for the page; default: view/ in its results.")
@@ -116,7 +116,7 @@ def view(
     the result of body_fit. The page needs no network and no server. Every page of the site
     contains the same viewer.
 
-    Examples: intercap view cup_drink_s02 (of config/config.yaml);
+    Examples: intercap view cup_drink_s02 (of the project in this folder);
     intercap view config/demo/config.yaml cup_drink_s02
     """
     settings, sequence = find_sequence(settings, sequence)

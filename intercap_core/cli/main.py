@@ -26,8 +26,8 @@ app = typer.Typer(
     help=(
         "Multi-camera RGB-D recordings of people handling objects, turned into a finished 4D "
         "dataset.\n\n"
-        "[bold]A first look:[/bold] [cyan]intercap run config/demo/config.yaml[/cyan] makes three "
-        "virtual recordings and everything up to the report.\n\n"
+        "[bold]A first look, in a checkout:[/bold] [cyan]intercap run config/demo/config.yaml"
+        "[/cyan] makes three virtual recordings and everything up to the report.\n\n"
         "[bold]Own recordings, InterCap, BEHAVE:[/bold] [cyan]intercap init FOLDER --output "
         "lab[/cyan] writes settings and tables,\n\n"
         "[cyan]intercap check lab/config.yaml[/cyan] lists the problems in them, and\n\n"

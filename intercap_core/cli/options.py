@@ -12,8 +12,23 @@ from intercap_core.errors import UserError
 if TYPE_CHECKING:
     from intercap_core.project import Project
 
-DEFAULT_SETTINGS = Path("config/config.yaml")
-Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
+
+def default_settings() -> Path:
+    """``config.yaml`` of the working directory if there is one, else ``config/config.yaml``."""
+    here = Path("config.yaml")
+    return here if here.exists() else Path("config") / here
+
+
+Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's settings.")]
+SettingsOrDefault = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SETTINGS",
+        help="The project's settings.",
+        default_factory=default_settings,
+        show_default="config.yaml or config/config.yaml",
+    ),
+]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
 Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all.")]
 
@@ -43,7 +58,7 @@ def open_project(settings: Path, sequence: str | None = None, threads: int = 1) 
 def find_sequence(settings: Path, sequence: str | None) -> tuple[Path, str | None]:
     """Return settings and sequence; a single argument that is no settings file is a sequence."""
     if sequence is None and not settings.exists() and settings.suffix not in (".yaml", ".yml"):
-        return DEFAULT_SETTINGS, str(settings)
+        return default_settings(), str(settings)
     return settings, sequence
 
 

@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from intercap_core.cli.options import (
-    DEFAULT_SETTINGS,
     Cores,
-    Settings,
+    SettingsOrDefault,
     open_project,
     prepare,
 )
@@ -89,6 +88,7 @@ def init(
     print_draft(draft, root)
     typer.echo(f"written: {', '.join(map(str, written))}")
     check(written[0])
+    typer.echo(f"next: intercap run {written[0]}")
 
 
 @app.command(
@@ -105,7 +105,7 @@ def tables(context: typer.Context, layout: str) -> None:
 
 
 @app.command()
-def check(settings: Settings = DEFAULT_SETTINGS) -> None:
+def check(settings: SettingsOrDefault) -> None:
     """Check settings, tables, annotations and recordings, and list every problem.
 
     Problems that others may follow from come first; fix them in this order. Opens each recording
@@ -138,7 +138,7 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 )
 def run(
     context: typer.Context,
-    settings: Settings = DEFAULT_SETTINGS,
+    settings: SettingsOrDefault,
     cores: Cores = 0,
     profile: Annotated[
         Path | None,
@@ -162,7 +162,7 @@ def run(
 
 @app.command()
 def status(
-    settings: Settings = DEFAULT_SETTINGS,
+    settings: SettingsOrDefault,
     every: Annotated[bool, typer.Option("--all", help="Include sequences that are done.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
@@ -181,7 +181,7 @@ def status(
 
 
 @app.command()
-def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
+def verify(settings: SettingsOrDefault) -> None:
     """Read every result completely and list the damaged ones; exits with status 1 if there are any.
 
     To make a damaged result again, delete it and run.
@@ -195,7 +195,7 @@ def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
 
 
 @app.command()
-def report(settings: Settings = DEFAULT_SETTINGS) -> None:
+def report(settings: SettingsOrDefault) -> None:
     """Write the site from the existing results: a page per sequence, tables, heatmaps, overview.
 
     Example: intercap report config/demo/config.yaml
@@ -231,7 +231,7 @@ def compare(
 
 @app.command()
 def release(
-    settings: Settings = DEFAULT_SETTINGS,
+    settings: SettingsOrDefault,
     only: Annotated[
         list[ReleasedKind] | None,
         typer.Option(help="Kinds of files to list; may repeat. Default: all."),

@@ -132,7 +132,7 @@ def _locks(project: Project) -> Finding:
     owner = lease_holder(project.results / "run")
     if owner is not None:
         return Finding("locks", NOTE, f"a run is active: {owner}")
-    if any(Path(".snakemake/locks").glob("*")):
+    if any((project.root / ".snakemake/locks").glob("*")):
         return Finding(
             "locks", NOTE,
             "there is a lock of Snakemake; `intercap run` removes it if its own run was killed; "
@@ -151,7 +151,7 @@ def _scheduler() -> Finding:
         return Finding(
             "scheduler", NOTE,
             f"{slurm}, but Snakemake's plugin for it is not installed: pip install "
-            "'intercap-core[slurm]'",
+            "'intercap-core[workflow]'",
         )  # fmt: skip
     return Finding("scheduler", GOOD, f"{slurm}, with {plugin.__name__}; see docs/cluster.md")
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console, Group
@@ -71,6 +72,8 @@ def run_workflow(
     """
     project = load_project(settings)
     check_bodies(project)
+    if find_spec("snakemake") is None:
+        raise UserError("runs need Snakemake: pip install 'intercap-core[workflow]'")
     console = Console(stderr=True)
     if DRY_RUN & set(arguments):
         command = snakemake_command(project, cores=cores, profile=profile, arguments=arguments)

@@ -93,8 +93,10 @@ def test_commands_of_groups_are_hidden_aliases() -> None:
 
 def test_view_and_annotate_take_a_sequence_of_the_default_settings(inside: Path) -> None:
     for command in ("view", "annotate"):
-        done = intercap(command, "good", folder=inside)
+        done = intercap(command, "good", folder=inside.parent)
         assert done.stderr.startswith("error: config/config.yaml: there is no such file")
+    done = intercap("view", "good", folder=inside)
+    assert "results/trial/good/frames.h5: no such file" in done.stderr
     done = intercap("view", "config.yaml", folder=inside)
     assert "name one of its sequences: good, bad, empty" in done.stderr
 

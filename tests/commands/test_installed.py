@@ -74,15 +74,30 @@ def captures(tmp_path: Path) -> Path:
     return folder
 
 
+MODULE = """
+from intercap_core.shipped import shipped
+configfile: "lab/project/config.yaml"
+module intercap:
+    snakefile: str(shipped("workflow/Snakefile"))
+    config: config
+use rule * from intercap
+"""
+
+
 def test_three_commands_need_no_checkout(packages: Path, captures: Path, tmp_path: Path) -> None:
-    def intercap(*arguments: str, folder: Path) -> str:
+    """From an installed wheel; and its rules as a module of another workflow."""
+
+    def run(*arguments: str, folder: Path) -> str:
         done = subprocess.run(
-            [sys.executable, "-m", "intercap_core.cli", *arguments],
+            [sys.executable, "-m", *arguments],
             cwd=folder, env={**os.environ, "PYTHONPATH": str(packages)},
             capture_output=True, text=True,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout + done.stderr
+
+    def intercap(*arguments: str, folder: Path) -> str:
+        return run("intercap_core.cli", *arguments, folder=folder)
 
     written = intercap("init", "captures", "--output", "project", folder=captures.parent)
     rows = [line.split() for line in written.splitlines()[1:4]]
@@ -92,3 +107,6 @@ def test_three_commands_need_no_checkout(packages: Path, captures: Path, tmp_pat
     planned = intercap("run", settings, "--", "--dry-run", folder=tmp_path)
     assert "results/captures/a_RGBD_Images_one/joint.h5" in planned
     assert not (tmp_path / ".snakemake").exists()  # it works in the project's folder
+    (tmp_path / "Snakefile").write_text(MODULE)
+    planned = run("snakemake", "--dry-run", "--cores", "1", folder=tmp_path)
+    assert "lab/project/results/captures/a_RGBD_Images_one/joint.h5" in planned

@@ -28,7 +28,9 @@ def _load():
     """Load and validate settings and tables before any job starts."""
     # Snakemake's own `config` has the scalars of YAML 1.1, in which 010 is 8.
     given = workflow.config_settings
-    path, *others = given.configfiles or [Path("config/config.yaml")]
+    # of the command line, or of a workflow that uses this one as a module
+    files = given.configfiles or workflow.configfiles
+    path, *others = files or [Path("config/config.yaml")]
     overrides = {}
     try:
         for values in (*map(read_yaml, others), given.config):
