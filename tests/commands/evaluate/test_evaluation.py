@@ -1,8 +1,7 @@
-"""Settings, figures and tables of `intercap dev evaluate`."""
+"""Settings and figures of `intercap dev evaluate`."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,17 +11,12 @@ import pytest
 
 from intercap_core.commands.evaluate import bodies as body_evaluation
 from intercap_core.commands.evaluate import objects as object_evaluation
-from intercap_core.commands.evaluate.captures import flat as capture_figures
-from intercap_core.commands.evaluate.captures import print_captures
-from intercap_core.commands.evaluate.field_scenes import print_scenes
-from intercap_core.commands.evaluate.objects import lost_by_draw, print_objects
+from intercap_core.commands.evaluate.objects import lost_by_draw
 from intercap_core.commands.evaluate.part import Measured, require_truth
 from intercap_core.commands.evaluate.run import PARTS, QUICK_SETTINGS
 from intercap_core.errors import UserError
-from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
-from intercap_core.evaluation.field_errors import FieldScene
+from intercap_core.evaluation.body_errors import BodyErrors
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
 from intercap_core.project import load_project
 
 CONFIGS = sorted(Path("config/capture").glob("*.yaml"))
@@ -97,24 +91,6 @@ def test_captures_without_truth_are_rejected() -> None:
         require_truth(load_project(Path("config/config.yaml")))
 
 
-def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    none = np.zeros(0)
-    slips = SlipCounts(found=1, missed=1, false=0, images_wrong=3, images=50)
-    many = CaptureErrors(
-        "many", "bare", np.array([0.02]), np.array([0.004]), np.array([-0.001]), np.array([np.nan]),
-        slips, 0.0015, 0.05, none,
-    )  # fmt: skip
-    alone = CaptureErrors("alone", "", none, none, none, none, slips, np.nan, np.nan, none)
-    found = Measured("capture", [many, alone], ["broken"])
-    print_captures([found])
-    flat = capture_figures([found])
-    assert flat["capture.captures"] == 2 and "capture.captures_spread" not in flat
-    printed = capsys.readouterr().out
-    for words in ("many", "alone", "broken", "1 of 2", "1.50", "extrinsics_floor_only_mm"):
-        assert words in printed
-    assert "nan" not in printed
-
-
 def _cup(translation: list[float], views: list[int]) -> ObjectErrors:
     count = len(translation)
     none = np.zeros(count, bool)
@@ -133,14 +109,6 @@ def test_keys_name_area_object_and_variant() -> None:
     assert flat["object.noise2_translation_median_mm"] == pytest.approx(2.5)
     assert flat["object.cup.noise2_lost_share"] == pytest.approx(1 / 3)
     assert flat["object.noise2_views_2.frames"] == 1
-
-
-def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    print_objects([Measured("object", [_cup([0.0021], [4])], ["kick_s09"])])
-    printed = capsys.readouterr().out
-    for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
-        assert words in printed
-    assert "nan" not in printed
 
 
 def test_reduced_bodies_share_recordings() -> None:
@@ -183,19 +151,6 @@ def _bodies() -> list[Measured[BodyErrors]]:
     ]
 
 
-def test_keys_of_compared_figures_are_stable() -> None:
-    clouds = {key: np.ones(1) for key in CLOUD_KEYS}
-    error = replace(_body("a", 50, flagged=True), clouds=clouds)
-    kinds = ("object", "object_noise2", "body_per_frame_shape", "body_rgb_only", "body_two_view")
-    flat = body_evaluation.flat([Measured(kind, [error]) for kind in kinds])
-    names = (
-        "pve_mm", "mpjpe_mm", "hand_mpjpe_mm", "hand_grasp_mpjpe_mm", "face_mm", "noise2_pve_mm",
-        "per_frame_shape_pve_mm", "cloud_to_mesh_mm", "mesh_to_cloud_visible_mm",
-        "rgb_only_mpjpe_mm", "two_view_mpjpe_mm", "bad_frames_recall", "bad_frames_precision",
-    )  # fmt: skip
-    assert {f"body.{name}" for name in names} <= flat.keys()
-
-
 def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
     flat = body_evaluation.flat(_bodies())
     assert flat["body.pve_mm"] == pytest.approx(6)
@@ -211,25 +166,3 @@ def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
     assert flat["body.bad_frames_precision"] == 1
     assert flat["body.bad_frames_share"] == pytest.approx(0.5)
     assert flat["body.two_view_bad_frames_recall"] == 0
-
-
-def test_bodies_are_printed_by_interaction_and_rig(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    body_evaluation.print_bodies(_bodies())
-    printed = capsys.readouterr().out
-    for words in ("drink", "sit", "2 views: a: no fit", "left_knee", "object_noise2/c", "yes"):
-        assert words in printed
-    assert "bad frames in all: 4 of 8; flags' recall 0.50, precision 1.00" in printed
-    assert "nan" not in printed
-
-
-def test_every_field_scene_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    one = np.array([0.004])
-    scene = FieldScene(
-        "walk", 15.0, one, one, one, np.array([False]), one, one + 0.002, one, 0.003, np.nan
-    )
-    print_scenes([Measured("field_floor", [scene], ["broken"])])
-    printed = capsys.readouterr().out
-    for words in ("field_floor: walk", "broken", "field.extrinsics_worse_cameras: 1"):
-        assert words in printed
