@@ -18,7 +18,7 @@ from tests.helpers import fitted_capture as fitted
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"))
+    return fitted.shared_capture(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

@@ -9,4 +9,4 @@ from tests.helpers import fitted_capture as fitted
 
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"))
+    return fitted.shared_capture(tmp_path_factory)

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
+import pytest
 import torch
 import yaml
 
@@ -52,6 +53,7 @@ from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequenceP
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import metrics
 from tests.helpers.bodies import open_body
+from tests.helpers.shared_folder import shared_folder
 from tests.helpers.synthetic_capture import fill, write_frames, write_person, write_scene
 from tests.helpers.synthetic_people import write_detections
 
@@ -172,6 +174,14 @@ def make_capture(
 def open_capture(folder: Path, *, object_name: str, total: int) -> Capture:
     """Return a capture that :func:`make_capture` has written."""
     return _pose_capture(folder, object_name, total)[0]
+
+
+def shared_capture(factory: pytest.TempPathFactory, total: int = 5) -> Capture:
+    """Return a capture of ``total`` frame sets that the tests of all workers share; read only."""
+    folder = shared_folder(
+        factory, f"capture_{total}", lambda folder: make_capture(folder, total=total)
+    )
+    return open_capture(folder, object_name="football", total=total)
 
 
 def _pose_capture(

@@ -15,15 +15,14 @@ from rich.console import Console
 
 from intercap_core.commands.closing import print_remarks, remarks
 from intercap_core.commands.inspect import print_summary
-from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
 from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
-from intercap_core.stages import export, metrics
+from intercap_core.stage_list import SEQUENCE_STAGES
+from intercap_core.stages import export
 from tests.helpers import fitted_capture as fitted
 
 SAYS = {
@@ -51,7 +50,8 @@ def _say(file: h5py.File, key: str, texts: list[str]) -> None:
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     folder = tmp_path_factory.mktemp("project")
-    capture = fitted.make_capture(folder, name="s01")
+    shared = fitted.shared_capture(tmp_path_factory)
+    capture = shared.copied(folder, *(s for s in shared.paths if s != "metrics"), name="s01")
     with h5py.File(capture.paths["joint"], "r+") as file:
         file["flagged"][1:3] = np.isin(PARTS, OF_OBJECT)
         file["flag_reason"][1:3] = fitted.LOST.encode()
@@ -59,13 +59,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
         _say(file, "note", ["", "its pose is as given", ""])
     path = fitted.write_project(folder, capture, "s01")
     made = load_project(path)
-    metrics.run(
-        paths=capture.inputs(*STAGES["metrics"].reads),
-        output=made.artefact("s01", "metrics"),
-        models=capture.models,
-        settings=MetricsSettings(),
-        fit_settings=fitted.FIT_SETTINGS,
-    )
+    capture.measure(made.artefact("s01", "metrics"))
     for stage in ("joint", "scene"):
         made.artefact("s01", stage).write_bytes(capture.paths[stage].read_bytes())
     run_step("summary", made, "s01")

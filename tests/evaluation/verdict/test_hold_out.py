@@ -33,7 +33,7 @@ STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit")
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"), total=6)
+    return fitted.shared_capture(tmp_path_factory, total=6)
 
 
 @contextmanager

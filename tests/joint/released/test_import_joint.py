@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import ExportSettings, MetricsSettings, PageSettings
+from intercap_core.config import ExportSettings, PageSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.pipeline.outcome import line
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import export, joint, metrics
+from intercap_core.stages import export, joint
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.site import write_site
+from tests.helpers.shared_folder import shared_folder
+from tests.helpers.site import make_two_captures, open_two_captures, write_site
 
 NAME = "s01_o03"
 MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
@@ -26,20 +27,8 @@ MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> fitted.Capture:
-    made = fitted.make_capture(tmp_path_factory.mktemp("ours"), name=NAME)
-    _measure(made)
-    return made
-
-
-def _measure(capture: fitted.Capture) -> None:
-    metrics.run(
-        paths=capture.inputs(*MEASURED),
-        output=capture.paths["metrics"],
-        models=capture.models,
-        settings=MetricsSettings(),
-        fit_settings=fitted.FIT_SETTINGS,
-        truth=capture.paths["truth"],
-    )
+    folder = shared_folder(tmp_path_factory, "two_captures", make_two_captures)
+    return open_two_captures(folder)[NAME]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +59,7 @@ def _import(capture: fitted.Capture, results: Path, folder: Path) -> fitted.Capt
 @pytest.fixture(scope="module")
 def imported(capture, results, tmp_path_factory) -> fitted.Capture:
     made = _import(capture, results, tmp_path_factory.mktemp("theirs"))
-    _measure(made)
+    made.measure(truth=True)
     return made
 
 
@@ -120,7 +109,7 @@ def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):
         made = _import(capture, tmp_path / "theirs.pkl", tmp_path)
     assert "varies by frame" in caplog.text
     with artefacts.read(made.paths["joint"], JOINT) as theirs:
-        assert theirs["flagged"].tolist() == [[t == 1] * 4 for t in range(5)]
+        assert theirs["flagged"].tolist() == [[t == 1] * 4 for t in range(4)]
         assert theirs.text("flag_reason")[1] == "no result in the imported file"
         assert np.isfinite(theirs["joints"]).all()
         ours = _left_hand(capture)
@@ -136,13 +125,13 @@ def _left_hand(capture: fitted.Capture) -> np.ndarray:
 def test_results_of_another_recording_are_refused(capture, results, tmp_path):
     values = pickle.loads((results / "res.pkl").read_bytes())
     short = {
-        key: value[:3] if len(value) == 5 else value for key, value in values.items()
+        key: value[:3] if len(value) == 4 else value for key, value in values.items()
         if key != "about"
     } | {"body_pose": values["body_pose"][:, : 63 * 3]}  # fmt: skip
     (tmp_path / "res.pkl").write_bytes(pickle.dumps(short))
-    with pytest.raises(UserError, match="holds 3 frames, sequence 's01_o03' has 5"):
+    with pytest.raises(UserError, match="holds 3 frames, sequence 's01_o03' has 4"):
         _import(capture, tmp_path, tmp_path)
-    many = values | {"betas": np.zeros((5, 600))}
+    many = values | {"betas": np.zeros((4, 600))}
     (tmp_path / "res.pkl").write_bytes(pickle.dumps(many))
     with pytest.raises(UserError, match="600"):
         _import(capture, tmp_path, tmp_path)
