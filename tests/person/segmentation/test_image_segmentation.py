@@ -156,19 +156,19 @@ def test_image_candidates_follow_those_of_the_detector(written, segmented, tmp_p
     inputs = (frames, scene, detections)
     moments = np.tile(np.arange(CAPTURE.sets)[:, None], (1, CAPTURE.views))
     found = Detections.load(detections).showing(moments)
-    alone = found.with_candidates_of(segmented).candidates(7, 1)
-    both = found.with_candidates_of(run(inputs, tmp_path / "both.h5", "both")).candidates(7, 1)
+    first = found.with_candidates_of(segmented)
+    second = found.with_candidates_of(run(inputs, tmp_path / "both.h5", "both"))
+    alone, both = (one.candidates(7, 1) for one in (first, second))
     assert [one.label for one in both] == ["cup"] + [""] * len(alone) and len(alone) > 0
     assert [one.index for one in both] == list(range(len(both)))
     assert [one.rle for one in both] == [rle, *(one.rle for one in alone)]
+    for t, c in np.ndindex(CAPTURE.sets, CAPTURE.views):  # and another run gives the same
+        if (t, c) != (7, 1):
+            again = [one.rle for one in second.candidates(t, c)]
+            assert again == [one.rle for one in first.candidates(t, c)]
     with artefacts.read(tmp_path / "both.h5", PERSON_SCHEMA) as artefact:
         person = artefacts.unpack_ragged(artefact["mask_offsets"], artefact["mask_rle"])
         # no candidate is the person, so the images give the mask
         assert artefact["mask_source"][7, 1] == FROM_IMAGES and person[7 * CAPTURE.views + 1]
     none = run(inputs, tmp_path / "detector.h5", "detector")
     assert [one.label for one in found.with_candidates_of(none).candidates(7, 1)] == ["cup"]
-
-
-def test_same_images_same_bytes(written, segmented, tmp_path):
-    again = run(written, tmp_path / "person.h5")
-    assert again.read_bytes() == segmented.read_bytes()
