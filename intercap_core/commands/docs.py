@@ -224,6 +224,10 @@ def artefacts_page() -> str:
         "the root attributes `schema`, `schema_version`, `frame`, `units`, `settings_digest` and",
         "`complete`; every dataset has a checksum and units. `intercap inspect FILE` prints one.",
         "",
+        "Exports are folders in other formats, `results/<dataset>/<sequence>/export`, and those of",
+        "all sequences as one are in `results/<dataset>/export`: see",
+        "[usage.md](usage.md#publish-a-dataset).",
+        "",
         *(schemas.__doc__ or "").split("\n\n", 1)[1].strip().splitlines(),
     ]
     for schema in vars(schemas).values():

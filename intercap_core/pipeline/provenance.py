@@ -148,19 +148,38 @@ def file_digest(path: Path) -> str:
 def _list_files(folder: Path, stage: str) -> dict[str, str]:
     """Checksum and size of the files that a stage wrote into ``folder``, without hidden ones.
 
-    The folder of the dataset's outputs also holds those of all sequences, which are left out.
+    The folder of the dataset's outputs also holds those of all sequences, which are left out. Of
+    several links to a file, one is read; none if the manifest of a sequence's export lists it.
     """
-    tops = [folder]
+    tops, known = [folder], {}
     if stage == "dataset":
         tops = [folder / name for name in (*DATASET_OUTPUTS, "site")]
+        known = _listed_links(folder)
     files = {}
     for top in tops:
         for path in [top] if top.is_file() else sorted(top.rglob("*")):
             name = path.relative_to(folder).as_posix()
             hidden = any(part.startswith(".") for part in Path(name).parts)
             if path.is_file() and not hidden and not name.startswith(f"site/{_PAGES}/"):
-                files[name] = f"{file_digest(path)}:{path.stat().st_size}"
+                status = path.stat()
+                inode = (status.st_dev, status.st_ino)
+                if inode not in known:
+                    known[inode] = f"{file_digest(path)}:{status.st_size}"
+                files[name] = known[inode]
     return files
+
+
+def _listed_links(folder: Path) -> dict[tuple[int, int], str]:
+    """Checksum and size by device and inode of the files of all exports that have several links."""
+    known = {}
+    for listed in folder.glob(f"*/export/{FILE}"):
+        manifest = read_manifest(listed.parent)
+        for name, value in manifest.outputs.items() if manifest is not None else ():
+            with contextlib.suppress(OSError):  # missing; not linked either
+                status = (listed.parent / name).stat()
+                if status.st_nlink > 1:
+                    known[status.st_dev, status.st_ino] = value
+    return known
 
 
 @cache

@@ -15,6 +15,7 @@ from intercap_core.pipeline import stage_inputs
 from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.pipeline.provenance import (
     Manifest,
+    file_digest,
     library_versions,
     read_manifest,
     write_manifest,
@@ -131,6 +132,26 @@ def test_texts_lie_in_no_heap(tmp_path: Path) -> None:
             for name in item.attrs:
                 info = h5py.check_string_dtype(item.attrs.get_id(name).dtype)
                 assert info is None or info.length is not None, name
+
+
+def test_links_to_listed_files_are_not_read_again(tmp_path: Path) -> None:
+    """The merged exports of a dataset link gigabytes of images that the exports' manifests list."""
+    own, merged = tmp_path / "s01" / "export", tmp_path / "export"
+    for folder in (own, merged):
+        folder.mkdir(parents=True)
+    for name in ("rgb.jpg", "same.jpg"):
+        (own / name).write_text("as recorded")
+    write_manifest(own, replace(MADE, stage="export"))
+    listed = read_manifest(own)
+    assert listed is not None and len(set(listed.outputs.values())) == 1
+    (merged / "rgb.jpg").hardlink_to(own / "rgb.jpg")
+    (merged / "copy.jpg").write_text("a copy")
+    (own / "rgb.jpg").write_text("as damaged")  # verify finds it by either manifest
+    write_manifest(tmp_path, replace(MADE, stage="dataset"))
+    made = read_manifest(tmp_path)
+    assert made is not None and made.outputs.keys() == {"export/rgb.jpg", "export/copy.jpg"}
+    assert made.outputs["export/rgb.jpg"] == listed.outputs["rgb.jpg"]
+    assert made.outputs["export/copy.jpg"] == f"{file_digest(merged / 'copy.jpg')}:6"
 
 
 def test_libraries_that_decide_numbers_are_named() -> None:

@@ -14,12 +14,14 @@ from intercap_core.config import FramesSettings
 from intercap_core.errors import UserError
 from intercap_core.pipeline.resources import (
     CUDA_MB,
+    IMAGES_MB,
     JOBS,
     extent_of,
     memory_mb,
     minutes,
     on_gpu,
     recorded_mb,
+    total_extent,
 )
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES, Extent
@@ -52,7 +54,7 @@ def test_requests_exceed_the_measured_memory(
     assert 1.25 * peak + 230 < asked < 2.5 * peak + 500
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", [*STAGES, "dataset"])
 def test_requests_grow_with_length_and_attempt(stage: str) -> None:
     tiny = project()
     for ask in (memory_mb, minutes):
@@ -85,6 +87,20 @@ def test_detectors_run_on_a_gpu_if_the_settings_say_so(tmp_path: Path) -> None:
     for stage in JOBS:
         more = memory_mb(on_cuda, stage, SHORT) - memory_mb(on_cpu, stage, SHORT)
         assert more == (CUDA_MB if stage == "detections" else 0)
+
+
+def test_exported_images_take_time_and_memory() -> None:
+    plain = project()
+    for name in ("images", "undistort"):
+        more = project(export={name: True})
+        assert memory_mb(more, "export", LONG) == memory_mb(plain, "export", LONG) + IMAGES_MB
+        assert minutes(more, "export", LONG) > minutes(plain, "export", LONG) + 100
+        assert minutes(more, "joint", LONG) == minutes(plain, "joint", LONG)
+
+
+def test_sequences_together_have_all_frames() -> None:
+    assert total_extent([SHORT, LONG, FEW]) == Extent(2045, 6)
+    assert total_extent([]) == Extent(0, 0)
 
 
 def test_virtual_recordings_have_the_extent_of_their_settings() -> None:

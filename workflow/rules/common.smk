@@ -18,9 +18,10 @@ from intercap_core.pipeline.resources import (
     minutes,
     on_gpu,
     recorded_mb,
+    total_extent,
 )
 from intercap_core.project import load_project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES, Extent
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from snakemake_executor_plugin_intercap_slurm.ledger import stamp
 
 
@@ -162,17 +163,19 @@ def read_by_dataset(wildcards):
 
 
 def length_of(wildcards):
-    """Extent of the sequence, from its frames artefact, the studio's settings, or a default."""
-    if not hasattr(wildcards, "sequence"):
-        return Extent(0, 0)
-    frames = PROJECT.artefact(wildcards.sequence, "frames")
-    changed = frames.stat().st_mtime_ns if frames.exists() else None
-    return length_since(wildcards.sequence, changed)
+    """Extent of the job's sequence, or of all sequences together."""
+    named = [wildcards.sequence] if hasattr(wildcards, "sequence") else SEQUENCES
+    frames = {name: PROJECT.artefact(name, "frames") for name in named}
+    return total_extent(
+        length_since(name, path.stat().st_mtime_ns if path.exists() else None)
+        for name, path in frames.items()
+    )
 
 
 @functools.cache
 def length_since(sequence, changed):
-    """Extent of a sequence whose frames artefact has the date ``changed``."""
+    """Extent of a sequence whose frames artefact has the date ``changed``: from this artefact, the
+    studio's settings, or a default."""
     return extent_of(PROJECT, sequence)
 
 

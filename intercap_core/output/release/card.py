@@ -60,6 +60,8 @@ FORMATS = {
     "amass": "*/export/amass/body.npz and object.npz: AMASS keys",
     "bop": "*/export/bop: the object's poses, masks and lenses in BOP's format",
     "coco": "*/export/coco/annotations.json: masks, boxes and keypoints of person and object",
+    "bop_merged": "export/bop: bop of all sequences as one dataset with the split test",
+    "coco_merged": "export/coco/annotations.json: coco of all sequences as one file",
     "glb": "*/export/glb: animated body and object",
     "contact": "*/export/contact: contact by frame and region, and the vertices that touch",
     "meshes": "*/export/meshes: body and object of each frame as mesh files",
@@ -115,7 +117,8 @@ def facts(
         "bodies": _bodies(summaries),
         "splits": {"subject": _split_to_json(by_subject, measured, "subject"),
                    "object": _split_to_json(by_object, measured, "object_")},
-        "formats": {name: FORMATS[name] for name in FORMATS if name in formats},
+        "formats": {name: what for name, what in FORMATS.items()
+                    if name.removesuffix("_merged") in formats},
         "conventions": CONVENTIONS,
         "stages": _stages(summaries),
         "software": dict(versions()),

@@ -41,6 +41,8 @@ _FILES = {  # glob pattern and media type of each export format
     "amass": ("*/export/amass/*.npz", "application/octet-stream"),
     "bop": ("*/export/bop/**/*.json", "application/json"),
     "coco": ("*/export/coco/annotations.json", "application/json"),
+    "bop_merged": ("export/bop/**/*.json", "application/json"),
+    "coco_merged": ("export/coco/annotations.json", "application/json"),
     "glb": ("*/export/glb/*.glb", "model/gltf-binary"),
     "contact": ("*/export/contact/*.tsv", "text/tab-separated-values"),
     "meshes": ("*/export/meshes/Mesh/*", "application/octet-stream"),

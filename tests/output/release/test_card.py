@@ -89,6 +89,7 @@ def test_markdown_has_a_head_that_hubs_read(folder: Path) -> None:
     for config in header["configs"]:
         assert (folder / config["data_files"]).is_file()
     assert CARD.description in body and "2026-03-01" in body and "A. Body, B. Object" in body
+    assert "| `export/bop` |" in body and "| `export/coco/annotations.json` |" in body
     assert "lost … frames / ago" in body  # a bar would end the cell
     for line in body.splitlines():
         if line.startswith("|"):
@@ -119,6 +120,8 @@ def test_a_croissant_loader_reads_the_tables(folder: Path) -> None:
     loader = pytest.importorskip("mlcroissant")
     dataset = loader.Dataset(jsonld=folder / "croissant.json")
     assert not dataset.metadata.ctx.issues.errors and not dataset.metadata.ctx.issues.warnings
+    globs = [file.includes for file in dataset.metadata.file_sets]
+    assert ["export/coco/annotations.json"] in globs and ["export/bop/**/*.json"] in globs
     assert dataset.metadata.license == ["CC-BY-4.0"] and dataset.metadata.version == "1.2.0"
     rows = list(dataset.records(record_set="splits"))
     assert [row["splits/sequence"] for row in rows] == [b"s01_o03", b"s01_o09", b"s01_o09_b"]
