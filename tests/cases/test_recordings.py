@@ -14,7 +14,7 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.image_files import ImagePair, read_depth
 from intercap_core.formats.recordings.layouts import open_layout
-from intercap_core.formats.recordings.timestamps import pair_images
+from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
 from intercap_core.scene.depth_scale import describe_depth_scale
@@ -114,9 +114,11 @@ def test_the_largest_number_is_no_depth(tmp_path, unit):
     np.testing.assert_array_equal(read_depth(tmp_path / "d.png", (3, 2), unit), expected)
 
 
-def pairs(names: list[str], depth: list[str], fps: float | None = 30.0) -> list[ImagePair]:
+def pairs(
+    names: list[str], depth: list[str], fps: float | None = 30.0, times: Timestamps | None = None
+) -> list[ImagePair]:
     files, depth_files = [Path(name) for name in names], [Path(name) for name in depth]
-    return pair_images(files, depth_files, fps=fps, offset_s=0, times=None, source=Path("k1"))
+    return pair_images(files, depth_files, fps=fps, offset_s=0, times=times, source=Path("k1"))
 
 
 def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):
@@ -127,7 +129,14 @@ def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):
     assert list(colour.items()) == [
         (1560000083949189 + 33362 * n, name) for n, name in enumerate(names)
     ]
-    assert [shot.time_us for shot in shots if shot.depth] == [1560000083950000, 1560000084017000]
+    depth = [shot.time_us for shot in shots if shot.depth]
+    assert depth == [1560000083950000, 1560000084017000]
+    for stated in ({name: 2.0 + n / 30 for n, name in enumerate(names)}, {0: 2, 1: 2.03, 2: 2.07}):
+        shots = pairs(names, ["1560000083.950000.png", "1560000084.017000.png"], times=stated)
+        own = [shot.time_us for shot in shots if shot.depth]
+        np.testing.assert_allclose(own, [2_000_811, 2_067_811], atol=4_000)
+    video = pairs([], ["1.033.png", "2.000.png"], times={0: 1.0, 1: 1.03, 2: 1.97})
+    assert [shot.time_us for shot in video] == [1_033_000, 2_000_000]
     assert [shot.time_us for shot in pairs(["k1.0000.png", "k1.0002.png"], [])] == [0, 66_667]
     assert [shot.time_us for shot in pairs(["0000.1.png", "0001.1.png"], [])] == [0, 33_333]
     with pytest.raises(UserError, match="no time between images at 5 a second"):

@@ -86,7 +86,8 @@ def pair_images(
     """Pair colour and depth files of one camera, with their times.
 
     Files are paired by the last number in their names, or by order if any name has no number of its
-    own. Decimal numbers of which both parts change (1305031102.175304.png) are times in seconds.
+    own. Decimal numbers of which both parts change (1305031102.175304.png) are times in seconds;
+    stated times of other images then give the difference of the clocks.
     Raises UserError, naming ``source``, if times are unknown or missing, or if whole numbers in the
     names are times.
 
@@ -102,7 +103,10 @@ def pair_images(
     pairs, named_by_time = _by_key(colour, depth, source)
     keys = sorted(pairs)
     if times is not None:
-        seconds = _stated(pairs, times, source)
+        seconds = {} if named_by_time and not colour else _stated(pairs, times, source)
+        if named_by_time:  # images without a stated time: those of depth between those of colour
+            later = [time - key for key, time in seconds.items()]
+            seconds = {key: key + float(np.median(later or [0.0])) for key in keys} | seconds
     elif named_by_time:
         taken = [key for key in keys if pairs[key][0] or not colour]
         _check_seconds(source, taken)
