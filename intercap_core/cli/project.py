@@ -142,7 +142,7 @@ def run(
     cores: Cores = 0,
     profile: Annotated[
         Path | None,
-        typer.Option(help="Snakemake workflow profile, a folder or a name: slurm for a cluster."),
+        typer.Option(help="Folder of a Snakemake workflow profile; slurm: that of the package."),
     ] = None,
 ) -> None:
     """Compute everything that is missing or out of date, and show the progress.
@@ -152,7 +152,7 @@ def run(
 
     Examples: intercap run config/demo/config.yaml;
     intercap run config/demo/config.yaml --cores 2 -- --until joint;
-    intercap run config/lab/config.yaml --profile slurm
+    intercap run lab/config.yaml --profile lab/slurm
     """
     from intercap_core.commands.run import run_workflow
 

@@ -136,7 +136,7 @@ def _locks(project: Project) -> Finding:
         return Finding(
             "locks", NOTE,
             "there is a lock of Snakemake; `intercap run` removes it if its own run was killed; "
-            "otherwise run `snakemake --unlock` when no Snakemake is active in this folder",
+            "otherwise run `intercap run SETTINGS -- --unlock` when no run is active",
         )  # fmt: skip
     return Finding("locks", GOOD, "none")
 

@@ -80,6 +80,12 @@ def test_snakemake_finds_no_fault_and_understands_the_profile(
     assert done.returncode == 0, done.stderr
 
 
+def test_conda_without_a_checkout_is_refused(flow: Flow) -> None:
+    done = flow.ask("--sdm", "conda", "--dry-run")
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert f"expected as the working directory: {flow.folder} is none; leave" in done.stderr
+
+
 def test_the_rule_graph_in_the_docs_is_up_to_date() -> None:
     sys.path.insert(0, str(ROOT / "tools"))
     try:

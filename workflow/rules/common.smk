@@ -3,6 +3,7 @@ import re
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
+from snakemake.settings.types import DeploymentMethod
 from snakemake.utils import update_config
 
 from intercap_core.errors import UserError
@@ -21,6 +22,7 @@ from intercap_core.pipeline.resources import (
     total_extent,
 )
 from intercap_core.project import load_project
+from intercap_core.shipped import shipped
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from snakemake_executor_plugin_intercap_slurm.ledger import stamp
 
@@ -41,6 +43,15 @@ def _load():
     except UserError as error:
         raise WorkflowError(str(error)) from None
 
+
+# The environment is installed from the folder that holds `.snakemake`.
+if DeploymentMethod.CONDA in workflow.deployment_settings.deployment_method and Path(
+    "pyproject.toml"
+).resolve() != shipped("pyproject.toml"):
+    raise WorkflowError(
+        "--sdm conda installs the environment from a checkout, expected as the working directory: "
+        f"{Path.cwd()} is none; leave the option out to use the environment of this program"
+    )
 
 PROJECT = _load()
 SETTINGS = PROJECT.config
