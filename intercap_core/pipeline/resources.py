@@ -97,7 +97,7 @@ def _added(project: Project, rule: str) -> tuple[float, float]:
     """Megabytes, and seconds per image, that settings add to a rule."""
     if rule == "detections" and has_model(project):
         return MODEL_MB, MODEL_SECONDS
-    if rule == "export" and (project.config.export.images or project.config.export.undistort):
+    if rule == "export" and has_images(project):
         return IMAGES_MB, IMAGES_SECONDS
     return 0.0, 0.0
 
@@ -106,6 +106,11 @@ def has_model(project: Project) -> bool:
     """Whether a detector runs, instead of files being read."""
     settings = project.config.detections
     return bool(settings.segmentation_model or settings.keypoint_model)
+
+
+def has_images(project: Project) -> bool:
+    """Whether exports contain images."""
+    return project.config.export.images or project.config.export.undistort
 
 
 def on_gpu(project: Project, rule: str) -> bool:
@@ -150,8 +155,11 @@ def disk_usage(project: Project) -> DiskUsage:
             else:
                 missing[stage] += 1
     scale, basis = _relative_size(project)
+    estimated = {stage: scale * STAGES[stage].output_bytes for stage in STAGES}
+    if has_images(project):
+        estimated["export"] += estimated["frames"]  # about the size of the recorded images
     per_output = {
-        stage: sum(known) / len(known) if known else scale * STAGES[stage].output_bytes
+        stage: sum(known) / len(known) if known else estimated[stage]
         for stage, known in sizes.items()
     }
     return DiskUsage(
@@ -201,6 +209,7 @@ def _relative_size(project: Project) -> tuple[float, str]:
 
 
 def _size(path: Path) -> int:
-    if path.is_file():
-        return path.stat().st_size
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    """Bytes of a file, or of all files of a folder; several links to a file count once."""
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    found = [file.stat() for file in files]
+    return sum({(status.st_dev, status.st_ino): status.st_size for status in found}.values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from intercap_core.pipeline.resources import (
     CUDA_MB,
     IMAGES_MB,
     JOBS,
+    disk_usage,
     extent_of,
     memory_mb,
     minutes,
@@ -96,6 +98,21 @@ def test_exported_images_take_time_and_memory() -> None:
         assert memory_mb(more, "export", LONG) == memory_mb(plain, "export", LONG) + IMAGES_MB
         assert minutes(more, "export", LONG) > minutes(plain, "export", LONG) + 100
         assert minutes(more, "joint", LONG) == minutes(plain, "joint", LONG)
+
+
+def test_disk_space_counts_images_of_exports_once(tmp_path: Path) -> None:
+    given = [project(), project(export={"images": True})]
+    moved = [p.config.model_copy(update={"results": tmp_path}) for p in given]
+    plain, tiny = (replace(p, config=c) for p, c in zip(given, moved, strict=True))
+    more = disk_usage(tiny)
+    less = disk_usage(plain)
+    added = more.per_output["export"] - less.per_output["export"]
+    assert added == less.per_output["frames"] > 0 and more.missing > less.missing
+    folder = tiny.artefact(next(iter(tiny.sequences)), "export")
+    (folder / "bop").mkdir(parents=True)
+    (folder / "bop" / "1.jpg").write_bytes(b"0" * 1000)
+    (folder / "1.jpg").hardlink_to(folder / "bop" / "1.jpg")
+    assert disk_usage(tiny).per_output["export"] == 1000
 
 
 def test_sequences_together_have_all_frames() -> None:
