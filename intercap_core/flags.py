@@ -6,7 +6,8 @@ trusted: a frame whose object is lost can have a reliable body.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +30,7 @@ class Flags:
     flagged: np.ndarray
     """(T, 4) bool, by part in the order of ``PARTS``."""
     reasons: Sequence[str]
-    """(T,) reasons in words, joined by "; "; "" = no part is flagged."""
+    """(T,) parts and reasons, such as "object, contact: lost; hands: occluded"; "" = no flag."""
 
     @classmethod
     def of(cls, frames: int, causes: Sequence[Cause], *, has_object: bool = True) -> Flags:
@@ -37,14 +38,19 @@ class Flags:
 
         Without an object, object and contact are never flagged.
         """
-        flagged = np.zeros((frames, len(PARTS)), bool)
-        reasons: list[dict[str, None]] = [{} for _ in range(frames)]
+        possible = [part for part in PARTS if has_object or part not in OF_OBJECT]
+        by_reason: dict[str, np.ndarray] = {}  # (T, 4) flags of each reason
         for mask, reason, parts in causes:
-            flagged[np.ix_(mask, np.isin(PARTS, parts))] = True
-            for frame in np.flatnonzero(mask):
-                reasons[frame][reason] = None
-        flagged[:, np.isin(PARTS, OF_OBJECT)] &= has_object
-        return cls(flagged, ["; ".join(texts) for texts in reasons])
+            of_cause = mask[:, None] & np.isin(PARTS, [p for p in parts if p in possible])
+            by_reason[reason] = by_reason.get(reason, False) | of_cause
+        flagged = np.zeros((frames, len(PARTS)), bool)
+        clauses: list[list[str]] = [[] for _ in range(frames)]
+        for reason, of_reason in by_reason.items():
+            flagged |= of_reason
+            for frame in np.flatnonzero(of_reason.any(axis=1)):
+                parts = itertools.compress(PARTS, of_reason[frame])
+                clauses[frame].append(f"{', '.join(parts)}: {reason}")
+        return cls(flagged, ["; ".join(frame) for frame in clauses])
 
     @classmethod
     def read(cls, artefact: Artefact) -> Flags:
@@ -61,15 +67,22 @@ class Flags:
         return Flags(self.flagged | other.flagged, ["; ".join(filter(None, pair)) for pair in both])
 
     def at(self, frame: int) -> dict[str, Any]:
-        """Serialize one frame for JSON: names of its flagged parts, and the reasons."""
+        """Serialize one frame for JSON: names of its flagged parts, and the reasons by part."""
         parts = [part for part, on in zip(PARTS, self.flagged[frame], strict=True) if on]
         return {"flagged": parts, "flag_reason": self.reasons[frame]}
 
-    def texts(self) -> list[str]:
-        """(T,) parts and reasons in words, such as "object, contact: object lost"; "" = none."""
+    def reasons_of(self, part: str) -> list[str]:
+        """(T,) reasons for the flags of one part, without its name; "" = not flagged."""
         return [
-            f"{', '.join(np.array(PARTS)[row])}: {reason}" if reason else ""
-            for row, reason in zip(self.flagged, self.reasons, strict=True)
+            "; ".join(reason for parts, reason in _clauses(text) if part in parts)
+            for text in self.reasons
+        ]
+
+    def texts(self) -> list[str]:
+        """(T,) parts and reasons to print, such as "object and contact (object lost)"."""
+        return [
+            "; ".join(f"{_join(parts)} ({reason})" for parts, reason in _clauses(text))
+            for text in self.reasons
         ]
 
     def shares(self) -> dict[str, float]:
@@ -81,3 +94,14 @@ class Flags:
         counts = zip(PARTS, self.flagged.sum(axis=0), strict=True)
         words = ", ".join(f"{part} {count}" for part, count in counts if count)
         return f"flagged: {words or 'none'} of {len(self.flagged)} frames"
+
+
+def _clauses(text: str) -> Iterator[tuple[list[str], str]]:
+    """Yield the parts and the reason of each clause of a frame's text."""
+    for clause in filter(None, text.split("; ")):
+        parts, _, reason = clause.rpartition(": ")
+        yield parts.split(", "), reason
+
+
+def _join(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))

@@ -50,7 +50,7 @@ _CAMERA_COVARIANCE = {
 }  # fmt: skip
 _FLAGS = {
     "flagged": Field(("T", "4"), "bool", "body, hands, object and contact of this frame are not reliable"),
-    "flag_reason": Field(("T",), "str", "reasons of all parts in words; empty = no part is flagged"),
+    "flag_reason": Field(("T",), "str", "parts and reasons, such as 'object, contact: object lost; hands: occluded'; empty = no part is flagged"),
 }  # fmt: skip
 _OBJECT_POSE = {
     "rotation": Field(("T", "3", "3"), "float64", "rotation of master_from_object; NaN in all frames = no object", "1", "master"),

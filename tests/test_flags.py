@@ -9,8 +9,15 @@ def test_a_cause_flags_its_parts_and_the_others_stay_trusted():
     lost, unseen = np.array([1, 0, 1], bool), np.array([0, 0, 1], bool)
     flags = Flags.of(3, [(lost, "object lost", OF_OBJECT), (unseen, "no images", PARTS)])
     assert flags.flagged.astype(int).tolist() == [[0, 0, 1, 1], [0, 0, 0, 0], [1, 1, 1, 1]]
-    assert flags.reasons == ["object lost", "", "object lost; no images"]
-    assert flags.texts()[0] == "object, contact: object lost"
+    every = "body, hands, object, contact: no images"
+    assert flags.reasons == [
+        "object, contact: object lost",
+        "",
+        f"object, contact: object lost; {every}",
+    ]
+    assert flags.texts()[:2] == ["object and contact (object lost)", ""]
+    assert flags.reasons_of("object") == ["object lost", "", "object lost; no images"]
+    assert flags.reasons_of("hands") == ["", "", "no images"]
 
 
 def test_a_person_alone_has_no_flags_of_object_and_contact():

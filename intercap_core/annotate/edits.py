@@ -13,6 +13,7 @@ from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.evaluation.flags import ranges, runs
+from intercap_core.flags import Flags
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import FRAMES, JOINT, PERSON, SCENE
@@ -52,9 +53,9 @@ def _contact(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]
         return
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         names, probability = joint.text("region_names"), joint["contact_probability"]
-        labels, reasons = joint["contact_annotated"], joint.text("flag_reason")
+        labels, reasons = joint["contact_annotated"], Flags.read(joint).reasons_of("contact")
     flags = ranges(
-        ["; ".join(part for part in text.split("; ") if _OF_CONTACT in part) for text in reasons]
+        ["; ".join(why for why in text.split("; ") if _OF_CONTACT in why) for text in reasons]
     )
     if not annotation.contact:
         count = int((probability.max(1) >= TOUCHING).sum())
@@ -94,7 +95,7 @@ def _poses(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]:
         return
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         poses = rigid(joint["rotation"], joint["translation"])
-        reasons = joint.text("flag_reason")
+        reasons = Flags.read(joint).reasons_of("object")
     mesh = opened.cached("whole mesh", (), lambda: ObjectMesh.load(entry))
     for stated in annotation.poses:
         annotated = f"object placed in frame {stated.frame}"

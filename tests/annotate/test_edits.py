@@ -35,8 +35,8 @@ def _fitted(settings: Path, touching: slice, labels: slice, reason: str = "") ->
         (slice(1, 4), slice(1, 4), "", None, "1 to 3", ""),
         (slice(1, 5), slice(1, 4), "", "end", "1 to 4", "uncertain"),
         (slice(2, 3), slice(2, 3), "", None, "2 to 2", "before this edit"),
-        (slice(1, 4), slice(1, 4), "body inside; contact of right_hand annotated 0.20 m from the "
-         "object or more", None, "1 to 3", "0.20 m"),
+        (slice(1, 4), slice(1, 4), "body: body inside; contact: contact of right_hand annotated "
+         "0.20 m from the object or more", None, "1 to 3", "0.20 m"),
         (slice(0, 0), slice(1, 4), "", "both", "no contact", "uncertain"),
     ],
 )  # fmt: skip

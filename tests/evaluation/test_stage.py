@@ -109,7 +109,8 @@ def test_the_floor_of_cloud_distances_is_below_the_fit(measured: dict[str, np.nd
 
 def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
     assert measured["flag_reason"].tolist() == [
-        fitted.LOST, "", "", "", "person seen in fewer than two views, without depth",
+        fitted.FLAG_REASON, "", "", "",
+        "body, hands, contact: person seen in fewer than two views, without depth",
     ]  # fmt: skip
     parts = [PARTS[p] for p in np.flatnonzero(measured["flagged"][0])]
     assert parts == ["object", "contact"]  # the body of this frame is measured

@@ -60,6 +60,7 @@ from tests.helpers.synthetic_people import write_detections
 FPS = 15.0
 BODY_OFFSET_M = 0.010  # the fitted body is this much below the true one
 LOST = "object lost, filled in"  # reason of the flag of the first frame
+FLAG_REASON = f"object, contact: {LOST}"
 OBJECT_OFFSET_M = 0.004  # the tracked ball is below the true one; half of it after joint
 SUBJECT = SubjectEntry(subject="p01", gender="neutral")
 BODY_MODELS = BodyModels()
@@ -243,7 +244,7 @@ def lose_object(capture: Capture, doubts: str = "") -> None:
         for key in ("rotation", "translation", "contact_probability"):
             file[key][...] = np.nan
         file["flagged"][...] = np.isin(PARTS, OF_OBJECT)
-        file["flag_reason"][...] = LOST.encode()
+        file["flag_reason"][...] = FLAG_REASON.encode()
 
 
 def write_project(folder: Path, capture: Capture, name: str) -> Path:

@@ -54,7 +54,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     capture = shared.copied(folder, *(s for s in shared.paths if s != "metrics"), name="s01")
     with h5py.File(capture.paths["joint"], "r+") as file:
         file["flagged"][1:3] = np.isin(PARTS, OF_OBJECT)
-        file["flag_reason"][1:3] = fitted.LOST.encode()
+        file["flag_reason"][1:3] = fitted.FLAG_REASON.encode()
     with h5py.File(capture.paths["scene"], "r+") as file:
         _say(file, "note", ["", "its pose is as given", ""])
     path = fitted.write_project(folder, capture, "s01")
@@ -107,7 +107,7 @@ def test_a_joint_fit_without_a_step_is_noted(project: Project, tmp_path: Path) -
 def test_flagged_frames_with_their_reasons(project: Project) -> None:
     flags, reasons = outcome.flagged_frames(project.artefact("s01", "metrics"))
     assert flags.summary() == "flagged: body 1, hands 1, object 3, contact 4 of 5 frames"
-    assert reasons[0] == (fitted.LOST, 3)
+    assert reasons[0] == (fitted.FLAG_REASON, 3)
 
 
 def _printed(project: Project, width: int = 80) -> list[str]:
@@ -119,7 +119,7 @@ def _printed(project: Project, width: int = 80) -> list[str]:
 def test_a_run_ends_with_remarks_worst_first(project: Project, logs: None) -> None:
     (found,) = remarks(project)
     assert found.share == pytest.approx((1 + 1 + 3 + 4) / 20)
-    assert "3, contact 4 of 5 frames: object lost, filled in (3)" in found.texts[0]
+    assert "3, contact 4 of 5 frames: object, contact: object lost, filled in (3)" in found.texts[0]
     assert "scene: camera k2: its pose is as given" in found.texts
     printed = "\n".join(_printed(project, width=200))
     assert "1 of 1 sequences have remarks, worst first" in printed

@@ -147,10 +147,9 @@ def _rows(
     s: SequenceMetrics, annotated: Sequence[ContactInterval] | None
 ) -> list[charts.TimelineRow]:
     """Return rows for flags, frames in contact, and contact of each region by source."""
-    reasons = s.flags.reasons
     rows = []
-    for part, mask in zip(PARTS, s.flags.flagged.T, strict=True):
-        found = flags.ranges([why if on else "" for why, on in zip(reasons, mask, strict=True)])
+    for part in PARTS:
+        found = flags.ranges(s.flags.reasons_of(part))
         marks = [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in found]
         if s.has_object or part not in OF_OBJECT:
             rows.append(charts.TimelineRow(f"flagged, {part}", marks))

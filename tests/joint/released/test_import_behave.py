@@ -173,8 +173,9 @@ def test_frames_without_results_are_filled_and_flagged(capture, release, tmp_pat
     with artefacts.read(made, JOINT) as theirs:
         assert theirs["flagged"].tolist() == [[True] * 4, [True] * 4, [False] * 4]
         assert theirs.text("flag_reason") == [
-            "no result in the imported files", "no person_fit.ply in the imported files", ""
-        ]  # fmt: skip
+            f"body, hands, object, contact: no {what} in the imported files"
+            for what in ("result", "person_fit.ply")
+        ] + [""]
         assert np.array_equal(theirs["joints"][0], theirs["joints"][2])
         assert np.isnan(theirs["surface_distance"][:2]).all()
         assert np.isfinite(theirs["surface_distance"][2]).all()
@@ -189,7 +190,7 @@ def test_body_far_from_its_mesh_is_flagged(capture, release, person):
     write_person(_folder_of(release, 1), vertices, person[1], pose)
     results = _read(capture, release)
     text = "body, hands, contact: the body is far from the mesh that it was fitted to"
-    assert results.flags.texts() == ["", text, ""]
+    assert results.flags.reasons == ["", text, ""]
     assert results.known.all()
 
 

@@ -110,7 +110,9 @@ def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):
     assert "varies by frame" in caplog.text
     with artefacts.read(made.paths["joint"], JOINT) as theirs:
         assert theirs["flagged"].tolist() == [[t == 1] * 4 for t in range(4)]
-        assert theirs.text("flag_reason")[1] == "no result in the imported file"
+        assert theirs.text("flag_reason")[1] == (
+            "body, hands, object, contact: no result in the imported file"
+        )
         assert np.isfinite(theirs["joints"]).all()
         ours = _left_hand(capture)
         # twelve components are not the whole pose, but near it

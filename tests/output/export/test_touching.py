@@ -189,7 +189,7 @@ def test_the_verdict_of_each_camera_is_exported(capture: fitted.Capture, everyth
 def test_bop_images_name_their_frame(capture: fitted.Capture, everything: Path) -> None:
     with artefacts.read(capture.paths["metrics"], METRICS) as measured:
         flags = Flags.read(measured)
-    assert flags.at(0) == {"flagged": ["object", "contact"], "flag_reason": fitted.LOST}
+    assert flags.at(0) == {"flagged": ["object", "contact"], "flag_reason": fitted.FLAG_REASON}
     for number, camera in enumerate(capture.rig):
         scene = everything / "bop" / "test" / f"{number:06d}"
         content = json.loads((scene / "scene_about.json").read_text())

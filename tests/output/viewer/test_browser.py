@@ -333,14 +333,14 @@ def test_text_from_files_is_escaped(capture: fitted.Capture, tmp_path: Path) -> 
     del changed.paths["metrics"]
     with changed.edit("joint") as file:
         reasons = file["flag_reason"][()].astype("S60")
-        reasons[0] = b"<img src=x onerror=alert(1)> </script>"
+        reasons[0] = b"body: <img src=x onerror=alert(1)> </script>"
         del file["flag_reason"]
         file["flag_reason"] = reasons
         file["flagged"][0] = [True, False, False, False]
     shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
     found = _browse(shown, "result.flag = root.querySelector('[data-part=flag]').innerHTML;")
     assert found["console"] == [] and "<b onclick" not in found["dom"]
-    assert found["result"]["flag"].startswith("flagged: body: &lt;img src=x")
+    assert found["result"]["flag"].startswith("not reliable here: body (&lt;img src=x")
 
 
 @needs_chromium

@@ -256,7 +256,7 @@ async function showInterCap(payload) {
     scrub.value = frame;
     const why = reasons.get(frame);
     find("time").textContent = `${(frame / header.fps).toFixed(2)} s, frame ${frame}`;
-    find("flag").textContent = why ? `flagged: ${why}` : "";
+    find("flag").textContent = why ? `not reliable here: ${why}` : "";
     root.dataset.frame = frame;
     if (!state.playing) updateAddress();
     draw();
