@@ -191,7 +191,7 @@ def test_texts_are_printed_as_they_are(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     print_summary(Path(project.artefact("s01", "joint")))
-    assert "  0 to 2: object lost, filled in" in capsys.readouterr().out
+    assert "  0 to 2: object, contact: object lost, filled in" in capsys.readouterr().out
     print_summary(Path(project.artefact("s01", "scene")))
     assert "  k2: its pose is as given" in capsys.readouterr().out
 
