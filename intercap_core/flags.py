@@ -48,8 +48,8 @@ class Flags:
         for reason, of_reason in by_reason.items():
             flagged |= of_reason
             for frame in np.flatnonzero(of_reason.any(axis=1)):
-                parts = itertools.compress(PARTS, of_reason[frame])
-                clauses[frame].append(f"{', '.join(parts)}: {reason}")
+                names = ", ".join(itertools.compress(PARTS, of_reason[frame]))
+                clauses[frame].append(f"{names}: {reason}")
         return cls(flagged, ["; ".join(frame) for frame in clauses])
 
     @classmethod
