@@ -7,6 +7,7 @@ expects a finite number reports the place. YAML is read by the safe loader.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import tomllib
@@ -122,16 +123,17 @@ _SCALARS = (
     ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("merge", "<<", "<"),
 )
+_KEYS_AS_TEXT = {f"{_TAG}{kind}" for kind, *_ in _SCALARS if kind != "merge"}
 
 
-class WrittenInteger(int):
-    """Integer that keeps its text, such as 01, since it may be a name."""
+class _Written:
+    """Number that keeps its text, such as 01 or 1e3, since it may be a name."""
 
     text: str
 
-    def __new__(cls, text: str) -> WrittenInteger:
+    def __new__(cls, text: str) -> Any:
         """Parse decimal digits."""
-        number = super().__new__(cls, text)
+        number = super().__new__(cls, text)  # type: ignore[call-arg]
         number.text = text
         return number
 
@@ -139,8 +141,16 @@ class WrittenInteger(int):
         return self.text
 
 
+class WrittenInteger(_Written, int):
+    """Integer of YAML."""
+
+
+class WrittenFloat(_Written, float):
+    """Finite floating-point number of YAML."""
+
+
 class YamlLoader(yaml.SafeLoader):
-    """The safe loader with the scalars of YAML 1.2. Numbers as keys are text.
+    """The safe loader with the scalars of YAML 1.2. Scalars as keys are text.
 
     Repeated keys are refused.
     """
@@ -148,11 +158,11 @@ class YamlLoader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (as the base class has it)
 
     def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
-        """Convert numbers as keys to their text; refuse a key that a mapping has twice."""
+        """Convert scalars as keys to their text; refuse a key that a mapping has twice."""
         seen = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode):
-                if key.tag in (f"{_TAG}int", f"{_TAG}float"):
+                if key.tag in _KEYS_AS_TEXT:
                     key.tag = f"{_TAG}str"
                 if (key.tag, key.value) in seen:
                     problem = f"{key.value[:60]!r} is given twice"
@@ -169,10 +179,17 @@ class YamlLoader(yaml.SafeLoader):
             return float("-inf" if text.startswith("-") else "inf")
         return WrittenInteger(text) if base and str(number) != text else number
 
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        """Return the number, which keeps its text if Python writes it otherwise."""
+        number = super().construct_yaml_float(node)
+        is_plain = str(number) == node.value or not math.isfinite(number)
+        return number if is_plain else WrittenFloat(node.value)
+
 
 for _kind, _pattern, _first in _SCALARS:
     YamlLoader.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"(?:{_pattern})$"), _first)
 YamlLoader.add_constructor(f"{_TAG}int", YamlLoader.construct_yaml_int)
+YamlLoader.add_constructor(f"{_TAG}float", YamlLoader.construct_yaml_float)
 
 
 def parse_yaml(text: str, loader: type[YamlLoader] = YamlLoader) -> Any:
@@ -192,6 +209,9 @@ class _YamlDumper(yaml.SafeDumper):
 for _kind, _pattern, _first in _SCALARS[1:3]:
     _YamlDumper.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(f"(?:{_pattern})$"), _first)
 _YamlDumper.add_representer(WrittenInteger, lambda dumper, value: dumper.represent_int(int(value)))
+_YamlDumper.add_representer(
+    WrittenFloat, lambda dumper, value: dumper.represent_float(float(value))
+)
 
 
 def dump_yaml(content: Any, *, sort_keys: bool = False) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from intercap_core.entries import ObjectEntry
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 from intercap_core.inputs.documents import (
     dump_yaml,
@@ -165,9 +166,15 @@ def test_yaml_scalars_are_those_of_version_1_2(text: str, value: Any) -> None:
     assert yaml.safe_load(dump_yaml({"a": text})) == {"a": text}  # also for readers of version 1.1
 
 
-def test_numbers_as_keys_and_names_are_text() -> None:
-    assert parse_yaml("{1: a, 02: b, 0.5: c}") == {"1": "a", "02": "b", "0.5": "c"}
-    assert str(parse_yaml("[02]")[0]) == "02"
+def test_scalars_as_keys_and_names_are_text() -> None:
+    keys = ["1", "02", "0.50", "1e3", "true", "False", "null", "~", ".inf"]
+    assert list(parse_yaml(f"{{{', '.join(f'{key}: a' for key in keys)}}}")) == keys
+    for text in ("02", "1e3", "0.50", "1.", ".5"):
+        assert str(parse_yaml(text)) == text and parse_yaml(text) == float(text)
+    entry = ObjectEntry.model_validate(
+        {"name": "box", "mesh": "a.ply"} | parse_yaml("labels: [1e3]")
+    )
+    assert entry.labels == ("1e3",)
 
 
 def _npz(path: Path, content: bytes) -> Path:

@@ -165,6 +165,7 @@ def test_a_layout_that_does_not_fit_is_refused(monkeypatch):
     for layout, count, words in (
         ("unknown", 133, "expected one of body_25, body_25b, coco, "),
         ("coco", 133, "expected the 17 of layout coco"),
+        (["coco"], 17, "states keypoint_layout .'coco'., expected one of body_25"),
         (None, 50, "expected one of 17, 23, 25, 26, 133, 134, 136"),
     ):
         with pytest.raises(ValueError, match=words):

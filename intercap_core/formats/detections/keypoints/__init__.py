@@ -129,7 +129,7 @@ def find_layout(count: int, name: str | None = None) -> KeypointLayout:
         name: name of the layout if the file states it.
     """
     if name is not None:
-        if name not in layouts():
+        if not isinstance(name, str) or name not in layouts():  # from a user's file
             known = ", ".join(sorted(layouts()))
             raise ValueError(f"states {LAYOUT_KEY} {quoted(name)}, expected one of {known}")
         expected = len(layouts()[name].points)
