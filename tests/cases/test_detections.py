@@ -123,6 +123,7 @@ def test_keypoint_files_numbered_from_1_beside_a_video(tmp_path):
         ("kinect_v2", "25 points are kinect_v2, not body_25, by their bones"),
         ("coco", "layout coco"),
         ("h36m", "17 points are h36m, not coco, by their bones"),
+        ("openpose_17", "17 points are openpose_17, not coco, by their bones"),
         ("coco_feet", "layout coco_feet"),
         ("halpe26", "layout halpe26"),
     ],

@@ -39,6 +39,7 @@ from intercap_core.formats.detections.keypoints import (
     PeopleFile,
     compare_bones,
     layouts,
+    mean_length,
     read_people,
     readers,
     visible,
@@ -255,9 +256,15 @@ def _recognise_layout(
         for name, layout in layouts().items()
         if name != assumed and len(layout.points) == count
     }
-    shares = {name: compare_bones(other.people) or np.inf for name, other in readings.items()}
-    best = min(shares, key=lambda name: shares[name], default=None)
-    if best is not None and shares[best] < min(MAX_SHARE_OF_OTHER * share, MAX_BONE_SHARE):
+    limit = min(MAX_SHARE_OF_OTHER * share, MAX_BONE_SHARE)
+    # Long bones fit several layouts if arms are in the place of legs, of which the mean is larger.
+    fitting = {
+        name: compare_bones(other.people, mean_length)
+        for name, other in readings.items()
+        if (compare_bones(other.people) or np.inf) < limit
+    }
+    best = min(fitting, key=lambda name: fitting[name] or np.inf, default=None)
+    if best is not None:
         found = readings[best]
         found.recognised.append(f"{count} points are {best}, not {assumed}, by their bones")
         return found

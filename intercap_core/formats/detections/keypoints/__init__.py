@@ -170,14 +170,26 @@ def visible(points: np.ndarray) -> np.ndarray:
         return np.isfinite(points).all(-1) & (points[..., 2] > 0) & (points[..., :2] != 0).any(-1)
 
 
-def compare_bones(people: np.ndarray) -> float | None:
-    """Length of long bones (upper quartile) as a share of the median distance of two body points.
+def _upper_quartile(lengths: np.ndarray) -> np.ndarray:
+    return np.nanquantile(lengths, BONE_QUANTILE, axis=1)
+
+
+def mean_length(lengths: np.ndarray) -> np.ndarray:
+    """Mean (P,) of the known lengths (P, B); sensitive to a few misplaced points."""
+    return np.nanmean(lengths, axis=1)
+
+
+def compare_bones(
+    people: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray] = _upper_quartile
+) -> float | None:
+    """Length of a person's bones as a share of the median distance of two body points.
 
     A wrong layout joins points at random, so its share is near 1. Returns the median over at most
     ``MAX_COMPARED`` people; None if no person has enough points.
 
     Args:
         people: keypoints (P, 135, 3) in the shared order.
+        statistic: length (P,) that stands for the lengths (P, B) of a person's bones, NaN = unseen.
     """
     body = people[:, BODY]
     seen = visible(body)
@@ -196,9 +208,7 @@ def compare_bones(people: np.ndarray) -> float | None:
     if not known.any():
         return None
     bones, pairs = bones[known], apart[known][:, first, second]
-    share = np.nanquantile(bones, BONE_QUANTILE, axis=1) / np.maximum(
-        np.nanmedian(pairs, axis=1), 1e-9
-    )
+    share = statistic(bones) / np.maximum(np.nanmedian(pairs, axis=1), 1e-9)
     return float(np.median(share))
 
 

@@ -54,16 +54,19 @@ HALPE_BODY = (
     *BODY, "head", "neck", "mid_hip", "left_big_toe", "right_big_toe", "left_small_toe",
     "right_small_toe", "left_heel", "right_heel",
 )  # fmt: skip
-# OpenPose's older body. The neck that DWPose and rtmlib insert is computed, so it is left out.
-DWPOSE_BODY = (
-    "nose", "middle_of_shoulders", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder",
-    "left_elbow", "left_wrist", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee",
-    "left_ankle", "right_eye", "left_eye", "right_ear", "left_ear",
+# OpenPose's older body without neck. DWPose and rtmlib insert a computed one, which is left out.
+OPENPOSE_17 = (
+    "nose", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow",
+    "left_wrist", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle",
+    "right_eye", "left_eye", "right_ear", "left_ear",
 )  # fmt: skip
+DWPOSE_BODY = ("nose", "middle_of_shoulders", *OPENPOSE_17[1:])
 WHOLE_BODY = (*BODY, *FEET, *FACE, *LEFT, *RIGHT)
 
 # OpenPose's experimental BODY_25B: COCO's points, neck and top of the head, feet.
 BODY_25B = (*BODY, "upper_neck", "head", *FEET)
+# PoseTrack18: COCO's points with neck and top of the head in place of the eyes.
+POSETRACK18 = ("nose", "upper_neck", "head", *BODY[3:])
 # Human3.6M, as VideoPose3D and mmpose order it. Its neck lies at the chin.
 H36M = (
     "mid_hip", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle",
@@ -84,6 +87,8 @@ LAYOUTS = (
     KeypointLayout("body_25b", BODY_25B),
     KeypointLayout("kinect_v2", KINECT_V2),
     KeypointLayout("h36m", H36M),
+    KeypointLayout("openpose_17", OPENPOSE_17),
+    KeypointLayout("posetrack18", POSETRACK18),
     KeypointLayout("coco", BODY, is_default=True),
     KeypointLayout("coco_feet", (*BODY, *FEET), is_default=True),
     KeypointLayout("coco_wholebody", WHOLE_BODY, is_default=True),
