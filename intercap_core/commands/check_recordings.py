@@ -68,7 +68,8 @@ class RecordingFindings:
     images: dict[str, CameraImages] = field(default_factory=dict, compare=False)
     """Images of each camera whose recording could be opened; their number may be estimated."""
     recognised: dict[str, set[str]] = field(default_factory=dict)
-    """Recognised layout, numbering and unit of the files, by kind: keypoints or candidates."""
+    """What was recognised, by kind. Of images: the source of their times. Of keypoints and
+    candidates: layout, numbering and unit."""
 
     def add_recognised(self, kind: str, texts: Iterable[str]) -> None:
         """Add what was recognised in one camera's files."""
@@ -319,6 +320,7 @@ def check_recordings(
         try:
             with layout.open(name) as recording:
                 posed.append(recording.camera)
+                findings.add_recognised("images", {recording.timing} - {""})
                 lens, depth = recording.camera.colour, recording.camera.depth
                 recordings[name] = CheckedRecording(
                     recording.source,

@@ -118,7 +118,9 @@ def pairs(
     names: list[str], depth: list[str], fps: float | None = 30.0, times: Timestamps | None = None
 ) -> list[ImagePair]:
     files, depth_files = [Path(name) for name in names], [Path(name) for name in depth]
-    return pair_images(files, depth_files, fps=fps, offset_s=0, times=times, source=Path("k1"))
+    return pair_images(
+        files, depth_files, fps=fps, offset_s=0, times=times, source=Path("k1")
+    ).pairs
 
 
 def test_names_that_are_times_in_seconds_as_in_tum_rgbd(tmp_path):

@@ -172,7 +172,7 @@ def _read_times(folder: Path) -> Any:
     source = folder / "timestamps.csv"
     times = read_timestamps(source)
     colour = [Path(f"frame_{n:04d}.jpg") for n in range(20)]
-    shots = pair_images(colour, [], fps=30, offset_s=0, times=times, source=source)
+    shots = pair_images(colour, [], fps=30, offset_s=0, times=times, source=source).pairs
     return times, [shot.time_us for shot in shots]
 
 

@@ -14,7 +14,7 @@ to a name. :meth:`CameraImages.match_numbers` compares the numbers with those of
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -26,13 +26,13 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import DetectionFile, ImageKey, Result
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.intercap import numbers_from_times
+from intercap_core.formats.recordings.numbering import number_fields
 from intercap_core.formats.recordings.plain import PlainLayout
 from intercap_core.inputs.files import printable
 
 FILES_NAMED = 3  # broken files or entries that a note names; the others are only counted
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
 _NUMBERS = re.compile(r"\d{1,25}")
-_DECIMALS = re.compile(r"\d{1,15}(?:\.\d{1,9})?")
 # Least share of the images that have a number, for numbers that count from 1; chosen.
 MIN_SHARE_SHIFTED = 0.5
 # Largest deviation of times from the images' times, in steps between two images; chosen.
@@ -79,7 +79,7 @@ class CameraImages:
         named = {name: places[stem] for name, stem in stems.items() if stem in places}
         if named and self.first_number is None:
             return named, ""
-        fields = _number_fields(stems)
+        fields = number_fields(stems, decimals=True)
         matches = [(field, *self.match_numbers(field.values())) for field in fields]
         # Numbers from 0 need no hypothesis, so they come first.
         for field, numbers, remark in sorted(matches, key=lambda match: bool(match[2])):
@@ -167,23 +167,6 @@ class CameraImages:
 def strip_suffix(name: str) -> str:
     """A file's name without folders (of any system) and without the suffix of an image."""
     return _SUFFIX.sub("", PurePosixPath(name.replace("\\", "/")).name)
-
-
-def _number_fields(stems: Mapping[str, str]) -> list[dict[str, float]]:
-    """Numbers that may identify the images, the last one of each name first.
-
-    A field is a number at the same place, counted from the end, in all names, and differs in all of
-    them. Decimal numbers, such as times in seconds, are the last fields.
-    """
-    fields = []
-    for form in (_NUMBERS, _DECIMALS):
-        found = {name: form.findall(stem)[::-1] for name, stem in stems.items()}
-        found = {name: numbers for name, numbers in found.items() if numbers}
-        for at in range(min(map(len, found.values()), default=0)):
-            field = {name: float(numbers[at]) for name, numbers in found.items()}
-            if len(set(field.values())) == len(field) and field not in fields:
-                fields.append(field)
-    return fields
 
 
 def find_repeated_number(names: Iterable[str]) -> list[str]:

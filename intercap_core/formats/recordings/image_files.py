@@ -164,6 +164,8 @@ class FilesRecording(CameraRecording):
         times = [time_us for time_us, _ in files]
         seconds = (times[-1] - times[0]) * 1e-6 if times else None
         faults, remarks = inspect_files(self._shots, self.camera.depth, self._decoding)
+        if self.camera.depth is not None:
+            remarks += list_unpaired(self._shots, self.fps)
         return RecordingPreview(size, len(files), seconds, 1.0, tuple(faults), tuple(remarks))
 
     def images(self) -> Iterator[Image]:
@@ -246,14 +248,34 @@ def read_pairs(
             except DamagedImage as error:
                 damaged.append(f"{depth.name} {error}")
     recording.notes += list_remarks(remarks)
-    of_colour, of_depth = (
-        np.sort([shot[0] for shot in shots if shot[kind] is not None]) for kind in (1, 2)
-    )
-    without = int((distance_to(of_colour, of_depth) > 0.5e6 / recording.fps).sum())
-    if lens is not None and without:
-        recording.notes.append(f"no depth image with {without} of its colour images")
+    if lens is not None:
+        recording.notes += list_unpaired(shots, recording.fps)
     if damaged:
         recording.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
+
+
+def list_unpaired(shots: list[ImagePair], fps: float) -> list[str]:
+    """Notes on colour images without depth, and depth images without colour, within half a period.
+
+    ``fps``: nominal images a second.
+    """
+    colour = [(shot.time_us, shot.colour) for shot in shots if shot.colour is not None]
+    depth = [(shot.time_us, shot.depth) for shot in shots if shot.depth is not None]
+    notes = []
+    for kind, images, other, partners in (
+        ("colour", colour, "depth", depth),
+        ("depth", depth, "colour", colour),
+    ):
+        if not images or not colour:  # of a video
+            continue
+        taken = np.sort([time_us for time_us, _ in partners])
+        distance = distance_to(np.array([time_us for time_us, _ in images]), taken)
+        without = [images[i][1].name for i in np.flatnonzero(distance > 0.5e6 / fps)]
+        if without:
+            notes.append(
+                f"no {other} image with {len(without)} of its {kind} images (first: {without[0]})"
+            )
+    return notes
 
 
 class AlignedRecording(FilesRecording):

@@ -100,7 +100,7 @@ class PlainLayout(RecordingLayout):
                 decoding=decoding,
             )
         else:
-            shots = pair_images(
+            paired = pair_images(
                 colour,
                 depth if with_depth else [],
                 fps=known.fps,
@@ -108,10 +108,11 @@ class PlainLayout(RecordingLayout):
                 times=times,
                 source=source,
             )
-            stated = np.array([shot.time_us for shot in shots if shot.colour])
+            stated = np.array([shot.time_us for shot in paired.pairs if shot.colour])
             recording = FilesRecording(
-                source, camera, shots, known.fps or frame_rate(stated) or 1.0, decoding
+                source, camera, paired.pairs, known.fps or frame_rate(stated) or 1.0, decoding
             )
+            recording.timing, recording.notes = paired.timing, paired.notes
         recording.notes += folder.notes(known) if folder else []
         if known.depth is not None and not depth:
             recording.notes.append(

@@ -92,6 +92,8 @@ class CameraRecording(ClosedOnExit, ABC):
     """The device's serial number, "" = not known."""
     depth_delay_us: int
     """Device time of a depth image minus that of its colour image, by design, microseconds."""
+    timing: str
+    """Source of the images' times, such as "by number"; "" = the device's or the file's clock."""
     truncated: bool
     """The recording was cut off. Final after :meth:`images`."""
     notes: list[str]
@@ -104,6 +106,7 @@ class CameraRecording(ClosedOnExit, ABC):
     ) -> None:
         self.source, self.camera = source, camera
         self.fps, self.serial, self.depth_delay_us = fps, serial, depth_delay_us
+        self.timing = ""
         self.truncated = False
         self.notes = []
         self.gravity = np.full(3, np.nan)

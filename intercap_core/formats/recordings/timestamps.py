@@ -5,16 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import ImagePair
+from intercap_core.formats.recordings.numbering import (
+    Numbering,
+    NumberingKind,
+    recognise_numbering,
+)
 from intercap_core.inputs.files import quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
-_DECIMAL = re.compile(r"(\d+)\.(\d+)(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
 
 
@@ -74,6 +79,17 @@ def frame_rate(times_us: np.ndarray) -> float | None:
     return float(1e6 / np.median(steps)) if len(steps) else None
 
 
+class PairedImages(NamedTuple):
+    """The image files of one camera."""
+
+    pairs: list[ImagePair]
+    """Files in order of time."""
+    timing: str
+    """Source of the times, which follows "images": by number, by time, ..."""
+    notes: list[str]
+    """Notes on files whose place is assumed; each follows the camera's name in a message."""
+
+
 def pair_images(
     colour: list[Path],
     depth: list[Path],
@@ -82,14 +98,15 @@ def pair_images(
     offset_s: float,
     times: Timestamps | None,
     source: Path,
-) -> list[ImagePair]:
+    images: int = 0,
+) -> PairedImages:
     """Pair colour and depth files of one camera, with their times.
 
-    Files are paired by the last number in their names, or by order if any name has no number of its
-    own. Decimal numbers of which both parts change (1305031102.175304.png) are times in seconds;
-    stated times of other images then give the difference of the clocks.
-    Raises UserError, naming ``source``, if times are unknown or missing, or if whole numbers in the
-    names are times.
+    Files are paired by the numbers in their names (:mod:`.numbering`). Decimal numbers of which
+    both parts change (1305031102.175304.png) are times in seconds; stated times of other images
+    then give the difference of the clocks. Raises UserError, naming ``source``, if times are
+    unknown or missing, if whole numbers in the names are times, or if the names do not determine
+    which files belong together.
 
     Args:
         colour: colour files.
@@ -99,15 +116,16 @@ def pair_images(
         times: times of :func:`read_timestamps`, which take precedence over ``fps``: by name, by
             name without suffix, by number, or one for each colour image in order.
         source: folder or video, for messages.
+        images: number of images of a video; 0 = unknown.
     """
-    pairs, named_by_time = _by_key(colour, depth, source)
+    pairs, kind, notes = _pair_by_key(colour, depth, source, times or {}, images)
     keys = sorted(pairs)
     if times is not None:
-        seconds = {} if named_by_time and not colour else _stated(pairs, times, source)
-        if named_by_time:  # images without a stated time: those of depth between those of colour
+        seconds = {} if kind == "time" and not colour else _stated(pairs, times, source)
+        if kind == "time":  # images without a stated time: those of depth between those of colour
             later = [time - key for key, time in seconds.items()]
             seconds = {key: key + float(np.median(later or [0.0])) for key in keys} | seconds
-    elif named_by_time:
+    elif kind == "time":
         taken = [key for key in keys if pairs[key][0] or not colour]
         _check_seconds(source, taken)
         step = float(np.median(np.diff(taken))) if len(taken) > 1 else None
@@ -132,11 +150,12 @@ def pair_images(
             f"{source}: an image would be taken at {latest:.3g} s, so the numbers in the names are "
             "likely times, or time_offset is no seconds; write a timestamps.csv in seconds"
         )
-    return [
+    shots = [
         ImagePair(round((seconds[key] + offset_s) * 1e6), *pairs[key])
         for key in keys
         if key in seconds
     ]
+    return PairedImages(shots, "by timestamps" if times is not None else f"by {kind}", notes)
 
 
 def _refuse_whole_times(numbers: list[float], fps: float, source: Path) -> None:
@@ -159,55 +178,81 @@ def _refuse_whole_times(numbers: list[float], fps: float, source: Path) -> None:
             )
 
 
-def _by_key(
-    colour: list[Path], depth: list[Path], source: Path
-) -> tuple[dict[float, tuple[Path | None, Path | None]], bool]:
-    """Colour and depth file by number or, if any name has no number of its own, by position.
+def _pair_by_key(
+    colour: list[Path], depth: list[Path], source: Path, times: Timestamps, images: int
+) -> tuple[dict[float, tuple[Path | None, Path | None]], NumberingKind, list[str]]:
+    """Colour and depth file by number, time or position, the kind of these keys, and notes.
 
-    The second value is whether the numbers are times in seconds.
+    If the names do not determine the order of the colour files, ``times`` by name determine it.
     """
-    by_time = any(_are_times(paths) for paths in (colour, depth))
-    number_of = _decimal if by_time else _number
-    by_number = [{number_of(path): path for path in paths} for paths in (colour, depth)]
-    are_numbered = all(
-        len(numbers) == len(paths) and None not in numbers
-        for numbers, paths in zip(by_number, (colour, depth), strict=True)
-    )
-    if not are_numbered:
-        order = {path.stem: index for index, path in enumerate(colour)}
+    try:
+        of_colour = recognise_numbering(colour, source)
+    except UserError:
+        stated = [times.get(path.name, times.get(path.stem, np.nan)) for path in colour]
+        if not np.isfinite(stated).all():
+            raise
+        of_colour = Numbering("order", np.argsort(np.argsort(stated, kind="stable")).tolist())
+    of_depth = recognise_numbering(depth, source / "depth", like=of_colour.keys)
+    kind = of_colour.kind if colour else of_depth.kind
+    notes: list[str] = []
+    if colour and depth and (kind == "order" or of_depth.kind != kind):
+        order = {path.stem: key for path, key in zip(colour, of_colour.keys, strict=True)}
         strays = [path.name for path in depth if path.stem not in order]
-        if strays and colour:
+        if strays:
             raise UserError(
                 f"{source}: depth/{strays[0]} has neither a number nor the name of a colour image; "
                 "number both alike"
             )
-        by_number = [
-            dict(enumerate(colour)),
-            {order.get(path.stem, index): path for index, path in enumerate(depth)},
-        ]
-    keys = {key for numbers in by_number for key in numbers if key is not None}
-    pairs = {key: (by_number[0].get(key), by_number[1].get(key)) for key in keys}
-    return pairs, by_time and are_numbered
+        of_depth = Numbering(kind, [order[path.stem] for path in depth])
+    elif depth and kind == "number" and (colour or images):
+        names = [path.name for path in colour] or [f"image {n}" for n in range(images)]
+        shift, note = _align(
+            dict(zip(of_colour.keys or range(images), names, strict=True)),
+            dict(zip(of_depth.keys, (path.name for path in depth), strict=True)),
+            source,
+        )
+        of_depth = Numbering(kind, [key - shift for key in of_depth.keys])
+        notes += [note] if note else []
+    if kind == "order" and colour and not times:
+        notes.append(
+            "its images are taken in the order of their names, which have no number of their own; "
+            "if images are missing, write a timestamps.csv"
+        )
+    by_key = [
+        dict(zip(numbering.keys, files, strict=True))
+        for numbering, files in ((of_colour, colour), (of_depth, depth))
+    ]
+    keys = {*by_key[0], *by_key[1]}
+    return {key: (by_key[0].get(key), by_key[1].get(key)) for key in keys}, kind, notes
 
 
-def _number(path: Path) -> float | None:
-    match = re.search(r"\d+(?=\D*$)", path.stem)  # the last number of the name
-    return int(match.group()) if match else None
+def _align(
+    images: Mapping[float, str], given: Mapping[float, str], source: Path
+) -> tuple[float, str]:
+    """Depth number minus colour number of one image, and a note if it is not 0.
 
+    Equal numbers belong together, unless there is one depth file for each colour image and all
+    numbers differ by one constant. Raises UserError if no number is equal otherwise.
 
-def _decimal(path: Path) -> float | None:
-    match = _DECIMAL.search(path.stem)
-    return float(match.group()) if match else None
-
-
-def _are_times(paths: list[Path]) -> bool:
-    """Whether all names end in decimal numbers.
-
-    Names of one whole part (k1.0001.png), or of one decimal part (0001.k1.png), have two numbers.
+    Args:
+        images: descriptions of the colour images by number.
+        given: names of the depth files by number.
+        source: folder or video, for messages.
     """
-    found = [_DECIMAL.search(path.stem) for path in paths]
-    parts = zip(*(match.groups() for match in found if match), strict=True)
-    return None not in found and all(len(set(part)) > 1 for part in parts) and bool(found)
+    first, first_given = min(images), min(given)
+    shift = first_given - first
+    if shift and [number - shift for number in sorted(given)] == sorted(images):
+        return shift, (
+            f"its depth has a counter of its own: depth/{given[first_given]} is taken for the "
+            f"depth of {images[first]}; if equal numbers belong together, remove the images "
+            "without a partner"
+        )
+    if not images.keys() & given.keys():
+        raise UserError(
+            f"{source}: no depth file has the number of a colour image, the first ones are "
+            f"depth/{given[first_given]} and {images[first]}; number both alike"
+        )
+    return 0, ""
 
 
 def _stated(

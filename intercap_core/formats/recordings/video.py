@@ -318,8 +318,15 @@ class VideoRecording(CameraRecording):
         self._remarks: Counter[str] = Counter()
         self._offset_s = offset_s
         self._times = None if times is None else list(times.values())
-        self._shots = pair_images(
-            [], depth, fps=rate, offset_s=offset_s, times=times, source=path.with_suffix("")
+        self.timing = "" if times is None else "by timestamps"
+        self._shots, _, self.notes = pair_images(
+            [],
+            depth,
+            fps=rate,
+            offset_s=offset_s,
+            times=times,
+            source=path.with_suffix(""),
+            images=int(self._stream.frames),
         )
         self._damaged = 0
         self._first_s: float | None = None  # time of the first image on the file's clock
