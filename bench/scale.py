@@ -67,8 +67,8 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
     """A project in the folder ``here`` whose sequences are copies of one sequence."""
     row, recordings = source.sequences[name], source.sequences[name].recordings.resolve()
     names = [f"seq_{number:03d}" for number in range(count)]
-    rows = ["\t".join(("sequence", "subject", "object", "recordings", "calibration", "keypoints",
-                       "candidates"))]  # fmt: skip
+    rows = ["\t".join(("sequence", "subject", "object", "layout", "recordings", "calibration",
+                       "keypoints", "candidates"))]  # fmt: skip
     for other in names:
         folder = here / "recordings" / other
         shutil.copytree(
@@ -76,7 +76,8 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
         )
         paths = [folder / path.resolve().relative_to(recordings)
                  for path in (row.calibration, row.keypoints, row.candidates) if path]  # fmt: skip
-        rows.append("\t".join((other, row.subject, row.object or "", *map(str, [folder, *paths]))))
+        known = (other, row.subject, row.object or "", row.layout)
+        rows.append("\t".join((*known, *map(str, [folder, *paths]))))
     (here / "sequences.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     shutil.copy(source.path.parent / source.config.subjects, here / "subjects.tsv")
     settings = {

@@ -42,7 +42,6 @@ SLOW = (
     "body_fit/test_terms.py",
     "commands/test_cli.py",
     "commands/test_extending.py",
-    "commands/test_installed.py",
     "evaluation/test_stage.py",
     "evaluation/verdict/test_hold_out.py",
     "formats/recordings/test_bad_recordings.py",

@@ -51,7 +51,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             recordings = project.recordings_made(name)
             assert recordings is not None
             recordings.mkdir(parents=True)
-            for file in ("capture.json", "truth.h5", "calibration.json", "k1.mkv"):
+            for file in ("capture.json", "truth.h5", "calibration.yaml", "k1.mp4"):
                 (recordings / file).write_text("made")
             for stage in STAGES:
                 _write(project.artefact(name, stage))
@@ -265,7 +265,7 @@ def test_companion_files_of_a_mesh_count(folder: Path) -> None:
         ("export/coco/annotations.json", DATASET),
         (f"{ONE}/export/amass/body.npz", _of(ONE, "export")),
         (f"site/sequences/{ONE}/viewer/data.bin", _of(ONE, "page")),
-        (f"recordings/{OTHER}/k1.mkv", _of(OTHER, "studio", *STAGES) | DATASET),
+        (f"recordings/{OTHER}/k1.mp4", _of(OTHER, "studio", *STAGES) | DATASET),
     ],
 )
 def test_a_cut_or_missing_file_of_any_output_is_made_again(

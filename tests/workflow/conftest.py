@@ -32,7 +32,7 @@ def _run(flow: Flow, *targets: str) -> None:
 
 @pytest.fixture(scope="session")
 def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
-    """The same recordings without studio and truth in another folder, after init and run.
+    """The same recordings without studio and truth in another folder, after init, check and run.
 
     The recordings of one of the two sequences are unreadable. The summary of the other one has been
     made by replay; its other results are those of ``flow``.
@@ -48,10 +48,11 @@ def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
         *("--dataset", "test", "--objects", "config/objects.yaml"),
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 of 2 sequences are ready to run" in done.stdout
     settings = other.folder / "config" / "lab"
     shutil.copy2(other.folder / "config" / "test" / "subjects.tsv", settings)  # genders
-    for path in (other.folder / "captures" / OTHER).glob("*.mkv"):
-        path.write_bytes(b"not a recording")
+    for path in (other.folder / "captures" / OTHER).glob("k*/*.jpg"):
+        path.write_bytes(b"no image")
     for place in (ONE, f"site/sequences/{ONE}"):
         shutil.copytree(flow.results / place, other.results / place)
     other.artefact(ONE, "summary").unlink()
