@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
+from intercap_core.inputs.files import describe_unread, list_files
 from intercap_core.project import Project, read_project, tidy
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def check_sequences(project: Project) -> Findings:
     findings = Findings()
     meshes = {name: _check_mesh(project, name, findings) for name in project.objects_named()}
     faults = findings.faults
-    faults += _annotations_without_sequence(project)
+    _check_annotations(project, findings)
     for name, row in project.sequences.items():
         try:
             annotation = project.annotation(name)
@@ -192,15 +193,20 @@ def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str
     return annotation.check_cameras(list(extrinsics.master_from_colour), extrinsics.master)
 
 
-def _annotations_without_sequence(project: Project) -> list[Fault]:
+def _check_annotations(project: Project, findings: Findings) -> None:
+    """Add a fault for each YAML file that no sequence reads, and notes on other files."""
     folder = tidy(project.path.parent / project.config.annotations)
     known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
     known |= {project.annotation_path(name) for name in project.sequences}
-    return [
+    unread = [path for path in list_files(folder) if path not in known]
+    yaml = [path for path in unread if path.suffix.lower() in (".yaml", ".yml")]
+    findings.faults += [
         Fault("", f"{path}: no sequence has this annotation's name; rename it to <sequence>.yaml")
-        for path in sorted(folder.glob("*.y*ml"))
-        if path not in known
+        for path in yaml
     ]
+    advice = "an annotation is <sequence>.yaml; rename or remove them"
+    others = (path for path in unread if path not in yaml)
+    findings.notes += [Fault("", note) for note in describe_unread(folder, others, advice)]
 
 
 def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:

@@ -19,11 +19,13 @@ from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import class_names
 from intercap_core.formats.detections.coco import LARGEST_ID
 from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.keypoints import layouts as keypoint_layouts
 from intercap_core.formats.recordings.extract import advice_on_size
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.layouts import list_unread, open_layout
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
 from intercap_core.geometry.camera.rig import Camera, Rig, count_facing_away
+from intercap_core.inputs.files import describe_unread, list_files
 from intercap_core.project import Project
 from intercap_core.schemas import TRUTH
 
@@ -168,6 +170,7 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
             f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
             f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
         )
+    findings.notes += _notes_on_unread(row, {*known, *layout.names})
     findings.notes += _notes_on_keypoints(project, row, posed, findings)
     findings.notes += _notes_on_candidates(project, row, posed, findings)
     findings.notes += _notes_on_object(project, row, posed, findings)
@@ -190,12 +193,34 @@ def faults_of_truth(path: Path) -> list[str]:
         return [f"column truth names a file without truth: {error}"]
 
 
+def _notes_on_unread(row: SequenceEntry, cameras: set[str]) -> list[str]:
+    """Notes on files in the folders of keypoints and candidates that are not read."""
+    read: set[Path] = set()
+    folders = {folder for folder in (row.keypoints, row.candidates) if folder and folder.is_dir()}
+    for camera in cameras:
+        if row.keypoints in folders:
+            whole, single = keypoint_files.keypoint_paths(row.keypoints, camera)
+            read.update(single if whole is None else [whole])
+        if row.candidates in folders:
+            read.update(candidate_files.candidate_paths(row.candidates, camera, row.layout))
+    return [
+        note
+        for folder in sorted(folders)
+        if not row.recordings.is_relative_to(folder)
+        for note in describe_unread(
+            folder,
+            (path for path in list_files(folder) if path not in read),
+            "docs/detectors.md names the files that are read; rename, convert or remove them",
+        )
+    ]
+
+
 def _notes_on_keypoints(
     project: Project, row: SequenceEntry, cameras: list[str], findings: RecordingFindings
 ) -> list[str]:
     """Notes on cameras without keypoints, and on the first keypoints of the others.
 
-    Adds a fault if no camera has keypoints.
+    Adds a fault if no camera has keypoints, or a single one of several cameras without depth.
     """
     settings = project.config.detections
     folder, notes = row.keypoints, []
@@ -215,6 +240,13 @@ def _notes_on_keypoints(
         return []
     if folder is None:
         return []
+    having = [name for name in cameras if keypoint_files.has_keypoints(folder, name)]
+    if len(having) == 1 < len(cameras) and not findings.depth and settings.keypoint_model is None:
+        findings.faults.append(
+            f"{folder}: keypoints of camera {having[0]} only, and no depth, so no joint can be "
+            "triangulated; add the keypoints of another camera, or depth"
+        )
+    layouts: set[str] = set()
     for name in cameras:
         if keypoint_files.has_keypoints(folder, name):
             if name in findings.images:
@@ -229,10 +261,18 @@ def _notes_on_keypoints(
                 notes += preview.notes
                 findings.faults += preview.faults
                 findings.add_recognised("keypoints", preview.recognised)
+                layouts |= preview.layouts
         elif settings.keypoint_model is None:
             notes.append(
-                f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
+                f"{folder} has no file of keypoints for {name}; add this camera's keypoints "
+                f"({name}.json or {name}/<image>_keypoints.json)"
             )
+    counts = [len(keypoint_layouts()[name].points) for name in layouts]
+    if len(set(counts)) < len(counts):
+        notes.append(
+            f"{folder}: the same number of points is recognised as different layouts in different "
+            f"cameras ({', '.join(sorted(layouts))}); name theirs in detections.keypoint_layout"
+        )
     return notes
 
 
@@ -254,6 +294,7 @@ def _notes_on_candidates(
                     folder, images, names=class_names(settings.category_names)
                 )
                 notes += preview.notes
+                findings.faults += preview.faults
                 findings.add_recognised("candidates", preview.recognised)
                 labels |= preview.labels
         elif settings.segmentation_model is None:

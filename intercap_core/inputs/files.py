@@ -7,7 +7,7 @@ import os
 import re
 import reprlib
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,6 +20,8 @@ from intercap_core.errors import UserError
 MAX_TEXT_BYTES = 1 << 24  # settings, a table of 100,000 recordings, a calibration of 100 cameras
 MAX_FILE_BYTES = 1 << 29  # COLMAP's points, a mesh, an image, a pickle, network weights, COCO JSON
 MAX_ARRAYS_BYTES = 1 << 30  # arrays of an .npz unpacked; SMPL-X's have 350 MB
+_DEEPEST = 3  # levels of folders that are searched for files that no reader uses
+_KINDS_NAMED = 4  # kinds of unused files that are named
 MAX_UNPACKING = 100  # bytes unpacked per byte of an .npz; deflate reaches 1,032 for zeros
 MIN_UNPACKED_BYTES = 1 << 26  # up to this size, any ratio is accepted
 
@@ -187,6 +189,36 @@ def parse_numbers(value: Any, where: str, field: str) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise UserError(f"{where}: {field} is {quoted(value)}, expected finite numbers; correct it")
     return numbers
+
+
+def list_files(folder: Path) -> list[Path]:
+    """Files below a folder, without hidden ones and those in hidden folders."""
+    files = []
+    for place, below, names in os.walk(folder, followlinks=True):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        below[:] = below if len(Path(place).relative_to(folder).parts) < _DEEPEST else []
+        files += [Path(place, name) for name in sorted(names) if not name.startswith(".")]
+    return files
+
+
+def describe_unread(folder: Path, unread: Iterable[Path], advice: str) -> list[str]:
+    """Notes on files below ``folder`` that no reader uses, one for each kind of file.
+
+    A kind is a folder and a suffix. Beyond the first ``_KINDS_NAMED``, kinds are only counted.
+    """
+    kinds: dict[tuple[str, str], list[Path]] = {}
+    for path in unread:
+        place = path.parent.relative_to(folder).as_posix()
+        kinds.setdefault(("" if place == "." else f"{place}/", path.suffix), []).append(path)
+    notes = [
+        f"{folder}: {place}{paths[0].name}"
+        + (f" and {n - 1} more of {place}*{suffix} are" if (n := len(paths)) > 1 else " is")
+        + " not used"
+        for (place, suffix), paths in kinds.items()
+    ]
+    if len(notes) > _KINDS_NAMED:
+        notes[_KINDS_NAMED:] = [f"{folder}: {len(notes) - _KINDS_NAMED} other kinds are not used"]
+    return [printable(f"{note}; {advice}") for note in notes]
 
 
 def _too_large(size: int, limit: int) -> str:

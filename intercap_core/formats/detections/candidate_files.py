@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import (
     CandidateFile,
     CandidateForm,
@@ -28,6 +29,7 @@ from intercap_core.formats.detections.image_numbers import (
     note_broken,
     note_faults,
     note_unmatched,
+    refuse_both,
     short_name,
     sort_by_image,
 )
@@ -69,11 +71,17 @@ def image_files(folder: Path, camera: str) -> list[Path]:
 
 def has_candidates(folder: Path, camera: str, layout: str) -> bool:
     """Whether there is any file for the camera."""
-    if camera_file(folder, camera) is not None or image_files(folder, camera):
-        return True
+    return bool(candidate_paths(folder, camera, layout))
+
+
+def candidate_paths(folder: Path, camera: str, layout: str) -> list[Path]:
+    """All files of a camera that are read."""
+    whole = camera_file(folder, camera)
+    paths = image_files(folder, camera) if whole is None else [whole]
     if layout == "intercap":
-        return find_release_masks(folder, camera) is not None
-    return (folder / camera).is_dir() and bool(find_instance_masks(folder / camera))
+        return paths + [mask.path for mask in (find_release_masks(folder, camera) or {}).values()]
+    masks = find_instance_masks(folder / camera) if (folder / camera).is_dir() else {}
+    return paths + [mask.path for of_image in masks.values() for mask in of_image]
 
 
 def holds_instances(folder: Path, camera: str, layout: str) -> bool:
@@ -98,6 +106,8 @@ def read_camera(
 ) -> CandidatesByImage:
     """Read all candidates of one camera.
 
+    Raises UserError for files of single images beside one of all images.
+
     Args:
         folder: folder of candidates of the sequence.
         images: the camera's images.
@@ -111,6 +121,7 @@ def read_camera(
         return candidates
     form = CandidateForm(images.size, names, min_score)
     path = camera_file(folder, images.name)
+    refuse_both(path, find_json_files(folder / images.name))
     if path is not None:
         try:
             content = parse_candidates(read_json(path), form)
@@ -246,6 +257,11 @@ def preview_candidates(
     size = images.size
     whole = camera_file(folder, images.name)
     files = image_files(folder, images.name)
+    try:
+        refuse_both(whole, find_json_files(folder / images.name))
+    except UserError as error:
+        preview.faults.append(str(error))
+        return preview
     _, remark = images.recognise_names(path.name for path in files)
     preview.recognised += [f"files {remark}"] if remark else []
     path = whole if whole is not None else next(iter(files), None)

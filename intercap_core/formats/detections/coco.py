@@ -90,6 +90,8 @@ class DetectionPreview:
     """Messages about files that the detections stage refuses."""
     labels: set[str] = field(default_factory=set)
     """Labels of the instances; empty for keypoints."""
+    layouts: set[str] = field(default_factory=set)
+    """Names of the keypoints' layouts; empty for candidates."""
     recognised: list[str] = field(default_factory=list)
     """Properties recognised by content: layout, numbering, unit."""
 

@@ -241,6 +241,16 @@ def find_json_files(folder: Path) -> list[Path]:
     return sorted(p for p in paths if p.suffix.lower() == ".json" and not p.name.startswith("."))
 
 
+def refuse_both(whole: Path | None, files: Collection[Path]) -> None:
+    """Raise UserError if a camera has files of single images beside a file of all images."""
+    first = next(iter(sorted(files)), None)
+    if whole is not None and first is not None and first.parent.parent == whole.parent:
+        raise UserError(
+            f"{whole}: holds detections of all images, and so do the {len(files)} files in "
+            f"{first.parent} (first: {first.name}); remove or move the outdated ones"
+        )
+
+
 def sort_by_image(
     file: DetectionFile[Result], images: CameraImages
 ) -> tuple[dict[int, list[Result]], list[str], str]:

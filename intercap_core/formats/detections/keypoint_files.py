@@ -30,6 +30,7 @@ from intercap_core.formats.detections.image_numbers import (
     note_broken,
     note_faults,
     note_unmatched,
+    refuse_both,
     short_name,
     sort_by_image,
 )
@@ -314,8 +315,9 @@ def keypoint_paths(folder: Path, camera: str) -> tuple[Path | None, list[Path]]:
 
 
 def has_keypoints(folder: Path, camera: str) -> bool:
-    """Whether there is a file or a folder for the camera."""
-    return find_camera_file(folder, camera) is not None or (folder / camera).is_dir()
+    """Whether there is any file for the camera."""
+    whole, single = keypoint_paths(folder, camera)
+    return whole is not None or bool(single)
 
 
 def read_camera(
@@ -323,8 +325,9 @@ def read_camera(
 ) -> PeopleByImage:
     """Read all keypoints of one camera.
 
-    Raises UserError if files can be loaded and none can be used, for two files of one image, or for
-    points whose layout cannot be recognised. Files that cannot be loaded are noted.
+    Raises UserError if files can be loaded and none can be used, for two files of one image, for
+    files of single images beside one of all images, or for points whose layout cannot be
+    recognised. Files that cannot be loaded are noted.
 
     Args:
         folder: folder of keypoints of the sequence.
@@ -346,6 +349,7 @@ def read_camera(
             )
         return reading
 
+    refuse_both(*keypoint_paths(folder, images.name))
     reading = _recognise_layout(read_as(layout), read_as, folder)
     return reading.finish(folder, images.name, full_confidence)
 
@@ -515,12 +519,14 @@ def preview_keypoints(
         return reading
 
     try:
+        refuse_both(*keypoint_paths(folder, images.name))
         reading = _recognise_layout(read_as(layout), read_as, folder)
         found = reading.finish(folder, images.name, full_confidence)
     except UserError as error:
         preview.faults.append(str(error))
         return preview
     preview.recognised += found.recognised
+    preview.layouts = reading.assumed if reading.layout is None else {reading.layout}
     where = next(iter(loaded), folder)
     preview.notes += [f"{where}: {note}" for note in found.notes if note not in found.recognised]
     if len(reading.people) and not visible(reading.people).any():

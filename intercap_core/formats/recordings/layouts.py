@@ -13,7 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout
-from intercap_core.inputs.files import printable
+from intercap_core.inputs.files import describe_unread
 
 # Patterns of the files and folders that the workflow watches, below the folder of recordings ("" =
 # that folder). A folder stands for all files below it.
@@ -69,7 +69,7 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
         pattern = pattern.replace(f"{{{name}}}", f"({'|'.join(map(re.escape, texts))})")
     pattern = pattern.replace("{camera}", CAMERA_NAME.pattern)
     is_read = re.compile(pattern, re.IGNORECASE)
-    unread: dict[tuple[str, str], list[str]] = {}
+    unread = []
     for folder, below, names in os.walk(sequence.recordings, followlinks=True):
         relative = Path(folder).relative_to(sequence.recordings)
         place = "" if relative == Path() else f"{relative.as_posix()}/"
@@ -80,29 +80,15 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
             and len(relative.parts) < _DEEPEST
             and not is_read.fullmatch(f"{place}{name}/")
         ]
-        for name in sorted(names):
-            suffix = Path(name).suffix
-            if (
-                not name.startswith(".")
-                and suffix.lower() not in _NO_RECORDINGS
-                and not is_read.fullmatch(f"{place}{name}")
-            ):
-                unread.setdefault((place, suffix), []).append(name)
-    notes = [
-        f"{sequence.recordings}: {place}{names[0]}"
-        + (f" and {n - 1} more of {place}*{suffix} are" if (n := len(names)) > 1 else " is")
-        + " not used"
-        for (place, suffix), names in unread.items()
-    ]
-    most = 4  # kinds that are named
-    if len(notes) > most:
-        notes[most:] = [f"{sequence.recordings}: {len(notes) - most} other kinds are not used"]
-    return [
-        printable(
-            f"{note}; layout {sequence.layout} reads {expected}; rename, move or convert them"
-        )
-        for note in notes
-    ]
+        unread += [
+            Path(folder, name)
+            for name in sorted(names)
+            if not name.startswith(".")
+            and Path(name).suffix.lower() not in _NO_RECORDINGS
+            and not is_read.fullmatch(f"{place}{name}")
+        ]
+    advice = f"layout {sequence.layout} reads {expected}; rename, move or convert them"
+    return describe_unread(sequence.recordings, unread, advice)
 
 
 def input_files(sequence: SequenceEntry) -> list[Path]:
