@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from intercap_core.formats.detections.keypoints import (
     to_shared,
 )
 from intercap_core.formats.detections.mask_files import MaskFile, read_masks
+from intercap_core.formats.recordings.image_files import DamagedImage
 from tests.cases import SEQUENCE, check, open_case
 
 SIZE = (320, 240)
@@ -283,12 +285,85 @@ def test_instances_of_palettes_colours_and_alpha(tmp_path):
     cv2.imwrite(str(tmp_path / "half.png"), cv2.GaussianBlur(half, (5, 5), 0))
     half[numbers == 1], half[numbers == 2] = (0, 0, 64), (0, 0, 128)  # classes of VOC
     cv2.imwrite(str(tmp_path / "dark.png"), half)
+    void = numbers.copy()
+    void[:4, :4] = 255
+    cv2.imwrite(str(tmp_path / "void.png"), void)
+    almost_white = cv2.GaussianBlur(np.where(numbers == 1, np.uint8(250), np.uint8(0)), (5, 5), 0)
+    cv2.imwrite(str(tmp_path / "almost_white.png"), almost_white)
     first, second = (30, 20, 60, 40), (200, 100, 60, 50)
     for name, boxes in (("palette", {first, second}), ("colours", {first, second}),
                         ("cut", {first}), ("smooth", {first}), ("half", {first}),
-                        ("dark", {first, second})):  # fmt: skip
+                        ("dark", {first, second}), ("void", {first, second}),
+                        ("almost_white", {first})):  # fmt: skip
         found = read_masks(MaskFile(tmp_path / f"{name}.png", "", numbered=True), SIZE)
-        assert {instance.box for instance in found} == boxes, name
+        assert [instance.box for instance in found] == sorted(boxes), name
+
+
+def test_inverted_masks_are_refused(tmp_path):
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[20:60, 30:90] = 0
+    cv2.imwrite(str(tmp_path / "a.png"), mask)
+    with pytest.raises(DamagedImage, match="inverted"):
+        read_masks(MaskFile(tmp_path / "a.png", "", numbered=True), SIZE)
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ([0.5] * 4, "all masks .*upper left quarter of the image of 320x240"),
+        ([2.0] * 4, "4 of 4 masks .*reach beyond .* of images of another size"),
+        ([1, 1, 1, 1 / 320], "entry 3 .*: its corners are shares of the image's size"),
+    ],
+)
+def test_candidates_of_another_size_are_noted(tmp_path, factors, words):
+    corners = np.array([100.0, 50, 160, 50, 160, 150, 100, 150])
+    entries = [
+        {"image_id": n, "category_id": 1, "segmentation": [(factor * corners).tolist()]}
+        for n, factor in enumerate(factors)
+    ]
+    (tmp_path / "k1.json").write_text(json.dumps(entries))
+    found = candidate_files.read_camera(tmp_path, camera(4), layout="plain", min_score=0, names={})
+    preview = candidate_files.preview_candidates(tmp_path, camera(4), names={})
+    for notes in (found.notes, preview.notes):
+        assert re.search(words, " ".join(notes))
+    assert len(found.by_image.get(3, [])) == (factors[3] > 0.1)
+
+
+def test_candidates_in_two_places_are_refused(tmp_path):
+    (tmp_path / "k1").mkdir()
+    for name in ("k1.json", "k1/0.json"):
+        (tmp_path / name).write_text("[]")
+    with pytest.raises(UserError, match=r"k1.json: .* and so do the 1 files in .*0.json"):
+        candidate_files.read_camera(tmp_path, camera(1), layout="plain", min_score=0, names={})
+    preview = candidate_files.preview_candidates(tmp_path, camera(1), names={})
+    assert "0.json" in preview.faults[0]
+
+
+def test_files_that_nothing_reads_are_named_by_check(tmp_path):
+    project = open_case("b24", tmp_path)
+    folder = project.path.parent
+    (folder / "keypoints" / "k2").rename(folder / "keypoints" / "K2")
+    paths = [folder / "keypoints" / "k3" / f"{n:05d}_keypoints.json" for n in range(20)]
+    for path in paths:
+        path.rename(path.with_suffix(".JSON"))
+    (folder / "candidates" / "k1").mkdir()
+    (folder / "candidates" / "k1" / "00000.npz").touch()
+    found = check(project)
+    for words in (
+        "keypoints: K2/00000_keypoints.json and 19 more of K2/*.json are not used",
+        "keypoints: k3/00000_keypoints.JSON and 19 more of k3/*.JSON are not used",
+        "candidates: k1/00000.npz is not used",
+    ):
+        assert any(words in note for note in found.notes)
+    assert any("keypoints of camera k1 only, and no depth" in fault for fault in found.faults)
+
+
+def test_cameras_of_different_layouts_are_noted(tmp_path):
+    project = open_case("b24", tmp_path)
+    for path in (project.path.parent / "keypoints" / "k2").iterdir():
+        content = {"people": [{"pose_keypoints_2d": person_of("body_25b")}]}
+        path.write_text(json.dumps(content))
+    assert any("different layouts" in note for note in check(project).notes)
 
 
 def test_openpose_people_may_state_their_layout():

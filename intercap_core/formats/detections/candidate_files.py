@@ -33,7 +33,11 @@ from intercap_core.formats.detections.image_numbers import (
     short_name,
     sort_by_image,
 )
-from intercap_core.formats.detections.instance import Instance
+from intercap_core.formats.detections.instance import (
+    Instance,
+    hint_on_size,
+    notes_on_extent,
+)
 from intercap_core.formats.detections.mask_files import (
     MaskFile,
     find_instance_masks,
@@ -143,7 +147,7 @@ def _add_file(
         candidates.by_image.setdefault(place, []).extend(instances)
     name = short_name(path)
     note_faults(candidates.notes, f"of {content.entries} results in {name}", content.faults)
-    candidates.notes += _notes_on_scale(content.scaled, content.shares, f" in {name}")
+    candidates.notes += _notes_on_place([content], images.size, f" in {name}")
     if remark:
         candidates.notes.append(f"images of {name} are {remark}")
     note_absent(candidates.notes, absent, images, name)
@@ -157,7 +161,7 @@ def _add_image_files(
     numbers, remark = images.recognise_names(by_name)
     absent, broken = [], []
     faults: list[str] = []
-    scaled = shares = entries = 0
+    read: list[CandidateFile] = []
     for name, path in by_name.items():
         place = numbers.get(name)
         if place is None or place not in images.recorded:
@@ -173,11 +177,10 @@ def _add_image_files(
             instances = [instance for _, instance in content.results]
             candidates.by_image.setdefault(place, []).extend(instances)
         faults += [f"{printable(name)}, {fault}" for fault in content.faults]
-        entries, scaled = entries + content.entries, scaled + content.scaled
-        shares += content.shares
+        read.append(content)
     note_broken(candidates.notes, "candidates", broken)
-    note_faults(candidates.notes, f"of {entries} results", faults)
-    candidates.notes += _notes_on_scale(scaled, shares)
+    note_faults(candidates.notes, f"of {sum(c.entries for c in read)} results", faults)
+    candidates.notes += _notes_on_place(read, images.size)
     if remark:
         candidates.notes.append(f"files of candidates are {remark}")
     without = len(images.recorded) - len(by_name) + len(absent)
@@ -186,16 +189,34 @@ def _add_image_files(
     note_unmatched(candidates.notes, "files of candidates", absent)
 
 
-def _notes_on_scale(scaled: int, shares: int, where: str = "") -> list[str]:
-    """Notes on the numbers of masks that were scaled from another resolution or from shares."""
+def _notes_on_place(
+    files: list[CandidateFile], size: tuple[int, int], where: str = ""
+) -> list[str]:
+    """Notes on masks that were scaled, and on probable masks of other images.
+
+    Args:
+        files: the results of one camera.
+        size: width and height of its images.
+        where: words after "masks".
+    """
     notes = []
+    scaled, shares = sum(file.scaled for file in files), sum(file.shares for file in files)
+    instances = [instance for file in files for _, instance in file.results]
+    beyond, count = sum(file.beyond for file in files), len(instances)
     if scaled:
         notes.append(f"{scaled} masks{where} scaled to the image's size")
     if shares:
         notes.append(
             f"{shares} masks{where} are given as shares of the image's size and scaled to pixels"
         )
-    return notes
+    if beyond:
+        notes.append(
+            f"{beyond} of {count} masks{where} reach beyond the image of {size[0]}x{size[1]} "
+            f"pixels and are cut{hint_on_size(beyond, count)}"
+        )
+    ends = [(instance.box[i] + instance.box[i + 2]) / size[i] for instance in instances
+            for i in (0, 1)]  # fmt: skip
+    return notes + notes_on_extent(f"masks{where}", max(ends, default=0.0), size)
 
 
 def _add_masks_of_camera(
@@ -286,7 +307,10 @@ def preview_candidates(
             f"{path}: masks are of another resolution than the images of {size[0]}x{size[1]} and "
             "will be scaled"
         )
+        parsed.scaled = 0
     if parsed.shares:
         preview.recognised.append("corners are shares of the image's size")
+        parsed.shares = 0
+    preview.notes += [f"{path}: {note}" for note in _notes_on_place([parsed], size)]
     preview.labels = {instance.label for _, instance in parsed.results}
     return preview

@@ -23,6 +23,7 @@ from intercap_core.formats.detections.instance import (
     Instance,
     are_polygons_shares,
     make_instance,
+    reaches_beyond,
     to_rle,
 )
 from intercap_core.inputs.documents import json_decoder, parse_json
@@ -67,6 +68,8 @@ class DetectionFile(Generic[Result]):
     """Number of results of another resolution than the images."""
     shares: int = 0
     """Number of masks whose corners are shares of the image's width and height."""
+    beyond: int = 0
+    """Number of masks that reach beyond the image."""
 
     @property
     def is_useless(self) -> bool:
@@ -162,6 +165,12 @@ def parse_candidates(
             score = _score(entry)
             if score < form.min_score:
                 continue
+            segmentation = _segmentation(entry)
+            if not head.shares and are_polygons_shares([segmentation]):
+                raise ValueError(
+                    "its corners are shares of the image's size, those of other results pixels; "
+                    "write pixels"
+                )
             instance, factors = _instance(entry, score, image, head, form.size)
         except ValueError as error:
             result.add_fault(f"entry {index}", image, error)
@@ -169,6 +178,7 @@ def parse_candidates(
             result.results.append((image, instance))
             result.scaled += factors not in ((1.0, 1.0), form.size)
             result.shares += factors == form.size
+            result.beyond += reaches_beyond(segmentation, factors, form.size)
         result.entries += 1
     return result
 

@@ -96,6 +96,41 @@ def are_polygons_shares(segmentations: Iterable[Any]) -> bool:
     return is_any_fractional
 
 
+def reaches_beyond(segmentation: Any, factors: tuple[float, float], size: tuple[int, int]) -> bool:
+    """Whether a corner of a polygon is more than a pixel outside an image of ``size``.
+
+    ``factors`` scale the corners to pixels. False for an RLE.
+    """
+    for polygon in _polygons(segmentation) or ():
+        corners = np.array(_numbers(polygon)[: len(polygon) // 2 * 2]).reshape(-1, 2) * factors
+        if (corners < -1).any() or (corners > np.array(size) + 1).any():
+            return True
+    return False
+
+
+def hint_on_size(outside: int, total: int) -> str:
+    """Question for a note on detections outside the image, "" unless most of them are."""
+    if 2 * outside <= total:
+        return ""
+    return "; are they of images of another size, or of another camera?"
+
+
+def notes_on_extent(kind: str, extent: float, size: tuple[int, int]) -> list[str]:
+    """Note if all detections lie in the upper left quarter of an image of ``size``.
+
+    Args:
+        kind: name of the detections.
+        extent: largest coordinate as a share of the image's width or height; 0 without any.
+        size: width and height.
+    """
+    if not 0 < extent < 0.5:
+        return []
+    return [
+        f"all {kind} lie in the upper left quarter of the image of {size[0]}x{size[1]} pixels; are "
+        "they of images of half the size?"
+    ]
+
+
 def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resize a mask (h, w) to ``size`` (width, height): (H, W) bool."""
     grey = np.where(mask, np.uint8(255), np.uint8(0))

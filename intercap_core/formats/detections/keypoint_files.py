@@ -34,7 +34,13 @@ from intercap_core.formats.detections.image_numbers import (
     short_name,
     sort_by_image,
 )
-from intercap_core.formats.detections.instance import MAX_SHARE, are_shares, scale_to
+from intercap_core.formats.detections.instance import (
+    MAX_SHARE,
+    are_shares,
+    hint_on_size,
+    notes_on_extent,
+    scale_to,
+)
 from intercap_core.formats.detections.keypoints import (
     KeypointReader,
     PeopleFile,
@@ -109,17 +115,13 @@ class KeypointCleaner:
         notes = []
         width, height = self.size
         if self.outside:
-            most = 2 * self.outside > self.seen
-            hint = "; are they of images of another size, or of another camera?" if most else ""
+            hint = hint_on_size(self.outside, self.seen)
             notes.append(
                 f"{self.outside} of {self.seen} keypoints lie outside the image of "
                 f"{width}x{height} pixels and count as not seen{hint}"
             )
-        if 0 < self.extent < 0.5 and not self.normalised:
-            notes.append(
-                f"all keypoints lie in the upper left quarter of the image of {width}x{height} "
-                "pixels; are they of images of half the size?"
-            )
+        if not self.normalised:
+            notes += notes_on_extent("keypoints", self.extent, self.size)
         if self.normalised:
             notes.append(
                 f"{self.normalised} people left out whose points all lie within "

@@ -64,7 +64,10 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
             f"has {image.shape[1]}x{image.shape[0]} pixels, the image {size[0]}x{size[1]}"
         ) from None
     instances = []
-    for mask in _split(image, file):
+    found = list(_split(image, file))
+    if len(found) == 1 and found[0][[0, -1]].all() and found[0][:, [0, -1]].all():
+        raise DamagedImage("covers the whole border of the image, as an inverted mask does")
+    for mask in found:
         fitting = mask if mask.shape == size[::-1] else resize_mask(mask, size)
         instance = make_instance(file.label, 1.0, masks.encode(fitting), size)
         if instance is not None:
@@ -114,13 +117,24 @@ def _is_smooth(level: np.ndarray) -> bool:
     return 2 * inner.sum() > np.count_nonzero(level) and bool(near[level > 0].all())
 
 
+def _has_void(image: np.ndarray) -> bool:
+    """Whether 255 is the void of a grey image of numbers, not the instance of a smooth mask."""
+    numbers = image[image < 255]
+    return 0 < numbers.max(initial=0) < MASK_THRESHOLD and not _is_smooth(image)
+
+
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
     """The masks (H, W) bool of a grey image."""
+    is_grey = image.dtype == np.uint8
     if file.inverted:
         yield image < MASK_THRESHOLD
-    elif not file.numbered or (image.dtype == np.uint8 and image.max() == 255):
+    elif not file.numbered or (is_grey and image.max() == 255 and not _has_void(image)):
         yield image >= MASK_THRESHOLD
+    elif is_grey and image.max() >= MASK_THRESHOLD and _is_smooth(image):
+        yield image >= image.max() / 2
     else:
+        if is_grey:  # of the classes of a data set, 255 is the void
+            image = np.where(image == 255, 0, image)
         values = np.unique(image)
         if len(values) > 1000:  # an image with more instances is not a mask
             raise DamagedImage(

@@ -51,16 +51,12 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
     """Width and height of a JPEG or PNG file; None if the content is no complete file.
 
     The size is that of the image as OpenCV decodes it: rotated by a JPEG's Exif orientation. The
-    image's end must be there (anything may follow that of a JPEG), and in a JPEG a scan. The chunks
-    of a PNG must fill the file: decoders reserve the memory that a chunk's length states. Pixels
-    are not decoded.
+    image's end must be there (anything may follow it), and in a JPEG a scan. The chunks of a PNG
+    must lie in the file: decoders reserve the memory that a chunk's length states. Pixels are not
+    decoded.
     """
     if content.startswith(PNG_START):
-        at = len(PNG_START)
-        while at < len(content):  # a chunk has 12 bytes more than its length states
-            at += 12 + int.from_bytes(content[at : at + 4], "big")
-        complete = content.endswith(PNG_END) and len(content) >= 33 and at == len(content)
-        return struct.unpack(">II", content[16:24]) if complete else None
+        return struct.unpack(">II", content[16:24]) if _png_end(content) >= 33 else None
     jpeg = _parse_jpeg(content)
     if jpeg is None or not jpeg.ended:
         return None
@@ -90,7 +86,7 @@ def store_colour(content: bytes, orientation_use: OrientationUse = "turn") -> tu
             raise DamagedImage("is cut off")
         if content[24:26] == b"\x10\0":
             raise DamagedImage("is a 16-bit grey PNG, as depth is; move depth files to depth/")
-        whole, orientation = content, stated_orientation(content)
+        whole, orientation = content[: _png_end(content)], stated_orientation(content)
     elif content.startswith((*TIFF_STARTS, b"BM")):
         kind = "BMP" if content.startswith(b"BM") else "TIFF"
         orientation, at = _exif_orientation(content)  # of a BMP: 1
@@ -170,6 +166,16 @@ def _decode_8_bit(content: bytes) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if channels == 1 else image[..., :3]
 
 
+def _png_end(content: bytes) -> int:
+    """Offset after the last chunk of a PNG file; 0 if the file is cut."""
+    at = len(PNG_START)
+    while at < len(content):
+        start, at = at, at + 12 + int.from_bytes(content[at : at + 4], "big")
+        if content[start + 4 : at] == PNG_END:
+            return at
+    return 0
+
+
 def _parse_jpeg(content: bytes) -> _Jpeg | None:
     """Parse the first image; None if it is none or has no data."""
     if not content.startswith(JPEG_START):
@@ -177,6 +183,7 @@ def _parse_jpeg(content: bytes) -> _Jpeg | None:
     at, data = 2, 0  # bytes
     size: tuple[int, int] | None = None
     orientation, orientation_at = 1, 0
+    has_exif = False  # the first segment counts, as in OpenCV
     end = len(content.rstrip(b"\0"))
     ended = False
     while (found := _MARKER.search(content, at)) is not None:
@@ -194,7 +201,8 @@ def _parse_jpeg(content: bytes) -> _Jpeg | None:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", content[at + 3 : at + 7].ljust(4, b"\0"))
             size = (width, height)
-        if marker == 0xE1 and content[at + 2 : at + 8] == b"Exif\0\0":
+        if marker == 0xE1 and content[at + 2 : at + 8] == b"Exif\0\0" and not has_exif:
+            has_exif = True
             orientation, where = _exif_orientation(content[at + 8 : after])
             orientation_at = at + 8 + where
         at = after

@@ -78,7 +78,11 @@ def test_files_named_after_the_images_follow_them(tmp_path):
     assert noses(found) == {n: [n + 1.0] for n in range(COUNT)}
     assert found.notes == ["1 keypoint files belong to no image (first: shot_5)"]
     named = [whole(n, image_id=f"shot_{n}.jpg") for n in (2, 4, 9)]
-    found = read(write(tmp_path / "k1.json", named).parent, images(stems))
+    with pytest.raises(
+        UserError, match=r"k1.json: .* and so do the 5 files in .*results_shot_1.json"
+    ):
+        read(write(tmp_path / "k1.json", named).parent)
+    found = read(write(tmp_path / "other" / "k1.json", named).parent, images(stems))
     assert noses(found) == {0: [], 1: [2], 2: [], 3: [4]}
     assert "1 results in" in found.notes[0] and "shot_9.jpg" in found.notes[0]
 
