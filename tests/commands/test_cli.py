@@ -40,12 +40,15 @@ ROOT = Path(__file__).resolve().parents[2]
 SCENE = ("stage", "scene", "config/demo/config.yaml", "cup_drink_s02")
 
 
-def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run the command line in this process."""
-    output, errors = io.StringIO(), io.StringIO()
+def intercap(
+    *arguments: str, folder: Path = ROOT, output: io.TextIOBase | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run the command line in this process; prints to ``output`` if it is given."""
+    errors = io.StringIO()
+    captured = output or io.StringIO()
     with (
         contextlib.chdir(folder),
-        contextlib.redirect_stdout(output),
+        contextlib.redirect_stdout(captured),
         contextlib.redirect_stderr(errors),
         mock.patch.object(sys, "argv", ["intercap", *arguments]),
         mock.patch.dict(os.environ, {"COLUMNS": "200"}),
@@ -55,7 +58,9 @@ def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProces
             status = 0
         except SystemExit as end:
             status = int(end.code or 0)
-    return subprocess.CompletedProcess(arguments, status, output.getvalue(), errors.getvalue())
+    captured.flush()
+    text = captured.getvalue() if isinstance(captured, io.StringIO) else ""
+    return subprocess.CompletedProcess(arguments, status, text, errors.getvalue())
 
 
 def test_help_is_quick_and_has_examples() -> None:
@@ -168,6 +173,12 @@ def test_threads_are_one_or_more(threads: str) -> None:
     assert "--threads" in done.stderr
 
 
+def test_long_faults_keep_their_ends() -> None:
+    assert UserError("a" * 2000).shortened() == "a" * 2000
+    text = UserError("a" * 5000 + "b" * 5000).shortened(100)
+    assert text == f"{'a' * 50} [...] {'b' * 50}"
+
+
 @pytest.fixture
 def small_project(tmp_path: Path) -> Path:
     """A folder with a project of one good sequence and two that lack files."""
@@ -183,6 +194,7 @@ def small_project(tmp_path: Path) -> Path:
     )
     (tmp_path / "rec").mkdir()
     (tmp_path / "points" / "k1").mkdir(parents=True)
+    (tmp_path / "points" / "k1" / "0_keypoints.json").write_text('{"people": []}')
     record(tmp_path / "rec", 0, range(1))
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
@@ -271,6 +283,7 @@ def test_check_reports_results_that_cannot_be_written(small_project: Path) -> No
         ),
         ("annotations/godo.yaml", "", "problem: annotations/godo.yaml: no sequence has this"),
         ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
+        ("annotations/good.YAML", "", "problem: annotations/good.YAML: no sequence has this"),
     ],
 )
 def test_check_opens_the_files(inside: Path, file: str, content: str | None, says: str) -> None:
@@ -282,6 +295,14 @@ def test_check_opens_the_files(inside: Path, file: str, content: str | None, say
         Path(file).write_text(content)
     (fault,) = check_sequences(project).faults
     assert says in f"problem: {fault}"
+
+
+@pytest.mark.parametrize("name", ["good.json", "good.yaml.txt"])
+def test_check_notes_other_files_of_annotations(inside: Path, name: str) -> None:
+    Path("annotations", name).touch()
+    project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
+    (note,) = check_sequences(project).notes
+    assert f"annotations: {name} is not used; an annotation is <sequence>.yaml" in str(note)
 
 
 def test_check_names_unknown_cameras(inside: Path) -> None:
@@ -329,7 +350,7 @@ def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> No
     record(Path("rec"), 1, range(1))
     (inside / "masks" / "k2.json").write_text("[]")
     (note,) = (str(note) for note in check_sequences(load_project(Path("config.yaml"))).notes)
-    assert "points has no folder k2 and no k2.json" in note
+    assert "points has no file of keypoints for k2" in note
 
 
 def notes_with(column: str, folder: str) -> list[str]:
@@ -342,7 +363,7 @@ def notes_with(column: str, folder: str) -> list[str]:
 
 
 LARGE = [
-    {"image_id": n, "category_id": 53, "segmentation": [[1, 2, 30, 2, 30, 40, 1, 40]]}
+    {"image_id": n, "category_id": 53, "segmentation": [[901, 502, 930, 502, 930, 540]]}
     for n in range(5000)
 ]
 
@@ -389,6 +410,7 @@ def test_check_reads_the_first_keypoints(
     inside: Path, name: str, content: object, says: str
 ) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
+    Path("points/k1/0_keypoints.json").unlink()
     Path("points", name).write_text(text)
     notes = [note for note in notes_with("keypoints", "points") if "candidates" not in note]
     assert len(notes) == bool(says), notes
@@ -501,6 +523,13 @@ def test_a_stage_rejects_inputs_of_another_sequence(small_project: Path) -> None
         "error: results/trial/good/frames.h5: holds sequence 'test', expected 'good'; "
         "delete it and re-run stage 'frames' for sequence 'good'\n"
     )
+
+
+def test_status_is_printed_on_terminals_of_any_encoding(inside: Path) -> None:
+    output = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    Path("config.yaml").write_text("dataset: trial\nexclude: [bad, empty]\n")
+    assert intercap("status", "config.yaml", folder=inside, output=output).returncode == 0
+    assert "trial: 1 missing of 1 sequences" in output.buffer.getvalue().decode("latin-1")
 
 
 def test_reasons_with_markup_are_printed_literally(inside: Path) -> None:
