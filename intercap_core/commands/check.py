@@ -198,7 +198,7 @@ def _check_annotations(project: Project, findings: Findings) -> None:
     folder = tidy(project.path.parent / project.config.annotations)
     known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
     known |= {project.annotation_path(name) for name in project.sequences}
-    unread = [path for path in list_files(folder) if path not in known]
+    unread = [path for path in list_files(folder) if path not in known and path.parent == folder]
     yaml = [path for path in unread if path.suffix.lower() in (".yaml", ".yml")]
     findings.faults += [
         Fault("", f"{path}: no sequence has this annotation's name; rename it to <sequence>.yaml")

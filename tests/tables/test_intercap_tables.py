@@ -68,7 +68,9 @@ def release(tmp_path, monkeypatch) -> Path:
             root, rig, numbers=numbers, colour=colour, depth=flat, sequence=sequence,
             calibration=calibration,
         )  # fmt: skip
-        (root / "keypoints" / sequence / "k1").mkdir(parents=True)
+        folder = root / "keypoints" / sequence / "k1"
+        folder.mkdir(parents=True)
+        (folder / "0_keypoints.json").write_text('{"people": []}')
     annotate(root, "subject01_motion03_seg1", contact="3\n6\n\n10\n400\n\n")
     annotate(root, "subject01_motion03_seg1_v2", contact="2\n5\n")
     annotate(root, "subject03_motion09_seg0", contact="4\n7\n", frame=3)
