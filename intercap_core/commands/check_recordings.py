@@ -18,7 +18,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import class_names
 from intercap_core.formats.detections.coco import LARGEST_ID
-from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.image_numbers import DOUBT, CameraImages
 from intercap_core.formats.detections.keypoints import layouts as keypoint_layouts
 from intercap_core.formats.recordings.extract import advice_on_size
 from intercap_core.formats.recordings.image_files import FilesRecording
@@ -101,7 +101,9 @@ class RecordingFindings:
             texts = [v for v in ids | names if isinstance(v, str)]
             numbers = {v for v in ids if isinstance(v, int) and 0 <= v <= LARGEST_ID}
             _, _, remark = images.match_keys(texts, numbers)
-            if recorded and remark:
+            if recorded and DOUBT in remark:
+                self.notes.append(f"{whole}: images are {remark}")
+            elif recorded and remark:
                 self.add_recognised(kind, [f"images {remark}"])
         if not recorded or not count:
             return

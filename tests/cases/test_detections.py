@@ -208,13 +208,44 @@ def test_ids_of_a_data_set_that_count_from_1(tmp_path):
     assert any("numbered from 1" in note for note in found.notes)
 
 
+NAMED = tuple(f"{n:05d}" for n in range(12))
+GAPPED = (*NAMED[:5], *NAMED[6:])
+
+
+@pytest.mark.parametrize(
+    ("stems", "names", "places", "remark"),
+    [
+        (NAMED, [f"{n + 1:05d}" for n in range(12)], range(12), "from 1, the images from 0"),
+        (NAMED, [f"{n + 40:05d}" for n in range(12)], range(12), "numbered from 40"),
+        (NAMED[1:], [f"{n:05d}" for n in range(11)], range(11), "from 0, the images from 1"),
+        (NAMED, [f"{n:05d}" for n in range(1, 13) if n != 7], [*range(1, 7), *range(8, 12)],
+         "begin at 1: set detections.keypoint_first_number"),
+        (NAMED[1:], ["00001", "00004", "00011", "00020"], [0, 3, 10], ""),
+        (GAPPED, [f"{n}.k1" for n in range(12)], [*range(5), *range(5, 11)], "as in the names"),
+        (GAPPED, [f"{n}.k1" for n in range(9)], range(9), "read as positions from 0, but may be"),
+        (GAPPED, [f"{n}.k1" for n in range(11)], range(11), ""),
+        ((), [f"{n + 100}" for n in range(12) if n != 7], [], "begin at 100: set detections."),
+        ((), [f"{n}" for n in range(2, 13, 2)], range(2, 12, 2), "begin at 2: set detections."),
+    ],
+)  # fmt: skip
+def test_names_beside_those_of_the_images(stems, names, places, remark):
+    images = camera(len(stems) or 12, stems)
+    found, stated = images.recognise_names(names)
+    matched = [found[name] for name in names if found.get(name) in images.recorded]
+    assert matched == list(places) and remark in stated and bool(remark) == bool(stated)
+    ids = {int(name.partition(".")[0]): found.get(name) for name in names}
+    if not set(names) & set(stems):
+        _, by_id, _ = images.match_keys((), ids)
+        assert [by_id[n] for n in ids if by_id.get(n) in images.recorded] == list(places)
+
+
 def test_numbers_beyond_the_last_image_do_not_move_those_that_begin_later(tmp_path):
     entries = [{"image_id": n, "keypoints": person_of("coco")} for n in range(2, 7)]
     (tmp_path / "k1.json").write_text(json.dumps(entries))
     found = read(tmp_path, camera(6))
     assert [n for n, people in found.by_image.items() if len(people)] == [2, 3, 4, 5]
-    (note,) = found.notes
-    assert "1 results in" in note and note.endswith("image numbers count from 0")
+    assert any("begin at 2: set detections.keypoint_first_number" in n for n in found.notes)
+    assert any("1 results in" in note and "(first: 6; it has" in note for note in found.notes)
 
 
 def test_keypoints_are_scaled_from_the_stated_size_or_from_shares(tmp_path):

@@ -29,6 +29,7 @@ from intercap_core.formats.detections.image_numbers import (
     note_broken,
     note_faults,
     note_unmatched,
+    preview_names,
     refuse_both,
     short_name,
     sort_by_image,
@@ -283,8 +284,7 @@ def preview_candidates(
     except UserError as error:
         preview.faults.append(str(error))
         return preview
-    _, remark = images.recognise_names(path.name for path in files)
-    preview.recognised += [f"files {remark}"] if remark else []
+    preview_names(preview, folder / images.name, [path.name for path in files], images)
     path = whole if whole is not None else next(iter(files), None)
     if path is None:
         return preview

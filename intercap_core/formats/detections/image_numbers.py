@@ -14,8 +14,9 @@ to a name. :meth:`CameraImages.match_numbers` compares the numbers with those of
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -23,13 +24,14 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.coco import DetectionFile, ImageKey, Result
+from intercap_core.formats.detections.coco import DetectionFile, DetectionPreview, ImageKey, Result
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.intercap import numbers_from_times
-from intercap_core.formats.recordings.numbering import number_fields
+from intercap_core.formats.recordings.numbering import number_fields, recognise_numbering
 from intercap_core.formats.recordings.plain import PlainLayout
 from intercap_core.inputs.files import printable
 
+DOUBT = "set detections."  # in remarks that leave the numbering to the user
 FILES_NAMED = 3  # broken files or entries that a note names; the others are only counted
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
 _NUMBERS = re.compile(r"\d{1,25}")
@@ -68,7 +70,8 @@ class CameraImages:
     def recognise_names(self, names: Iterable[str]) -> tuple[dict[str, int], str]:
         """Numbers of the images that names of files refer to; other names are left out.
 
-        If any name is that of an image file, only names of image files are matched. Otherwise a
+        If any name is that of an image file, only names of image files are matched, unless there is
+        one name for each image and all numbers differ from the images' by one constant. Otherwise a
         number in the names counts (``frame_0012_k1.jpg`` is image 12): the last one that differs
         in all names and that :meth:`match_numbers` recognises, otherwise the last one. If two names
         end in the same number and no other number differs, the result is empty. The second value
@@ -77,14 +80,22 @@ class CameraImages:
         stems = {name: strip_suffix(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
         named = {name: places[stem] for name, stem in stems.items() if stem in places}
-        if named and self.first_number is None:
-            return named, ""
         fields = number_fields(stems, decimals=True)
+        if named and self.first_number is None:
+            if len(named) == len(stems) or not fields or not self.numbers_in_names:
+                return named, ""
+            shifted = self._match_shifted(self.numbers_in_names, fields[0].values())
+            if shifted is not None and len(fields[0]) == len(stems):
+                start = min(self.numbers_in_names)
+                remark = f"numbered from {min(shifted):.0f}, the images from {start:.0f}"
+                return {name: shifted[number] for name, number in fields[0].items()}, remark
+            return named, self.remark_on_start(fields[0].values(), self.numbers_in_names)
         matches = [(field, *self.match_numbers(field.values())) for field in fields]
         # Numbers from 0 need no hypothesis, so they come first.
         for field, numbers, remark in sorted(matches, key=lambda match: bool(match[2])):
             if numbers is not None:
-                return {name: numbers[value] for name, value in field.items()}, remark
+                found = {name: numbers[n] for name, n in field.items() if n in numbers}
+                return found, remark
         last = {name: int(value) for name, value in fields[0].items()} if fields else {}
         return last, self.remark_on_start(last.values())
 
@@ -97,8 +108,8 @@ class CameraImages:
         """
         by_name, remark = self.recognise_names(names)
         matched, remark_on_ids = self.match_numbers(ids)
-        by_id = matched or {}
-        known_ids = self.recorded.intersection(by_id.get(n, n) for n in ids)
+        by_id = {n: n for n in ids} if matched is None else matched
+        known_ids = self.recorded.intersection(by_id.values())
         known_names = self.recorded.intersection(by_name.values())
         if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
             by_name = {}  # the numbers in the names do not number the images
@@ -108,17 +119,29 @@ class CameraImages:
         """Image number of each number of the detections, and a remark on how they count.
 
         None in place of the image numbers if the numbers fit no image or some of them do not.
-        Hypotheses in order: the stated first number; image numbers from 0; from 1, if the numbers
-        begin at 1 and end beyond the last image; from any number, or times, if there is one for
-        each image.
+        Hypotheses in order: the stated first number; image numbers from 0; the numbers in the names
+        of the images, if no number is beyond them; from 1, if the numbers begin at 1 and end beyond
+        the last image; from any number, or times, if there is one for each image.
         """
         first, given = min(self.recorded, default=0), sorted(set(numbers))
         if not given or not self.recorded:
             return None, ""
         if self.first_number is not None:
             return {n: int(n) - self.first_number + first for n in given}, ""
+        named = self.numbers_in_names
+        in_range = bool(named) and min(named) <= given[0] and given[-1] <= max(named)
         if self.recorded.issuperset(given):
-            return {n: int(n) for n in given}, self.remark_on_start(given)
+            remark = self.remark_on_start(given)
+            differs = in_range and any(named.get(n) != n for n in given)
+            if differs and not remark and len(given) < len(self.recorded):
+                remark = (
+                    "read as positions from 0, but may be the numbers in the images' names: set "
+                    "detections.keypoint_first_number or candidate_first_number, or write file_name"
+                )
+            return {n: int(n) for n in given}, remark
+        in_names = {n: named[n] for n in given if n in named}
+        if in_range and len(in_names) >= len(self.recorded.intersection(given)):
+            return in_names, "numbered as in the names of the images"
         if first != 0 or len(self.recorded) <= max(self.recorded):
             return None, ""  # the images have numbers of their own
         share = len(given) / len(self.recorded)
@@ -126,13 +149,39 @@ class CameraImages:
         if share >= MIN_SHARE_SHIFTED and begins_at_1:
             return {n: int(n) - 1 for n in given}, "numbered from 1"
         images = sorted(self.recorded)
-        if len(given) == len(images):
-            shift = given[0] - images[0]
-            if all(n - shift == image for n, image in zip(given, images, strict=True)):
-                return {n: int(n - shift) for n in given}, f"numbered from {given[0]:.0f}"
-            if self._are_times(np.array(given), np.array(images)):
-                return dict(zip(given, images, strict=True)), "named by time"
+        for numbers_of_images in (dict(zip(images, images, strict=True)), named):
+            shifted = self._match_shifted(numbers_of_images, given)
+            if shifted is not None:
+                return shifted, f"numbered from {given[0]:.0f}"
+        if len(given) == len(images) and self._are_times(np.array(given), np.array(images)):
+            return dict(zip(given, images, strict=True)), "named by time"
         return None, ""
+
+    @cached_property
+    def numbers_in_names(self) -> dict[float, int]:
+        """Place of each image by the number in its file's name; {} without such numbers."""
+        try:
+            numbering = recognise_numbering([Path(f"{stem}.x") for stem in self.stems], Path())
+        except UserError:
+            return {}
+        keys = numbering.keys if numbering.kind == "number" else []
+        return {number: place for place, number in enumerate(keys)}
+
+    def _match_shifted(
+        self, images: Mapping[float, int], numbers: Collection[float]
+    ) -> dict[float, int] | None:
+        """Image number of each number, if all numbers differ from the images' by one constant.
+
+        None if they do not, or if there is no number for each image. ``images``: image number by
+        the number with which the images count.
+        """
+        given, places = sorted(numbers), sorted(images)
+        if not given or len(given) != len(places):
+            return None
+        shift = given[0] - places[0]
+        if any(n - shift != place for n, place in zip(given, places, strict=True)):
+            return None
+        return {n: images[n - shift] for n in given}
 
     def _are_times(self, given: np.ndarray, images: np.ndarray) -> bool:
         """Whether numbers (N,) are the times of the images (N,) in any unit, from any start."""
@@ -150,15 +199,24 @@ class CameraImages:
                 return True
         return False
 
-    def remark_on_start(self, numbers: Iterable[float]) -> str:
-        """Warning if all images from 1 on have a number and image 0 has none, "" otherwise."""
-        given = set(numbers)
-        if not given or min(given) != min(self.recorded, default=0) + 1:
+    def remark_on_start(
+        self, numbers: Iterable[float], images: Collection[float] | None = None
+    ) -> str:
+        """Warning if the numbers may be shifted against those of the images, "" otherwise.
+
+        They may be if both their ends lie beyond those of the images in one direction, or if all
+        images from the second on have a number and the first has none. ``images``: numbers of the
+        images; None = positions.
+        """
+        given, known = set(numbers), images or self.recorded or {0}
+        if not given:
             return ""
-        if len(given) < max(0.9 * (max(given) - min(given) + 1), 2):
+        before, after = min(given) - min(known), max(given) - max(known)
+        is_dense = len(given) >= max(0.9 * (max(given) - min(given) + 1), 2)
+        if before * after <= 0 and not (before == 1 and is_dense):
             return ""
         return (
-            f"read as numbered from {min(self.recorded)}, but begin at {min(given):.0f}: "
+            f"read as numbered from {min(known):.0f}, but begin at {min(given):.0f}: "
             "set detections.keypoint_first_number or candidate_first_number if this is the first "
             "image"
         )
@@ -273,7 +331,7 @@ def sort_by_image(
     def number(key: ImageKey) -> int | None:
         if key.name is not None and (by_name or key.number is None):
             return by_name.get(key.name)
-        return None if key.number is None else by_id.get(key.number, key.number)
+        return None if key.number is None else by_id.get(key.number)
 
     if file.images is not None:
         known = {n for n in map(number, file.images) if n is not None}
@@ -298,11 +356,9 @@ def note_absent(notes: list[str], names: list[str], images: CameraImages, where:
     has = f"images {min(images.recorded)} to {max(images.recorded)}" if images.recorded else "none"
     if images.stems:
         has += printable(f", {images.stems[0]} to {images.stems[-1]}")
-    off_by_one = {str(max(images.recorded, default=-1) + 1)} == set(names)
-    hint = "; image numbers count from 0" if off_by_one else ""
     notes.append(
         f"{len(names)} results in {where} are of images that the recording does not have (first: "
-        f"{printable(names[0][:80])}; it has {has}){hint}"
+        f"{printable(names[0][:80])}; it has {has})"
     )
 
 
@@ -310,6 +366,21 @@ def note_faults(notes: list[str], what: str, faults: list[str]) -> None:
     """Note entries that were left out, the first ones with their reasons."""
     if faults:
         notes.append(f"{len(faults)} {what} left out: {'; '.join(faults[:FILES_NAMED])}")
+
+
+def preview_names(
+    preview: DetectionPreview, folder: Path, names: Iterable[str], images: CameraImages
+) -> None:
+    """Add the numbering of files of single images to a preview; doubts about it are notes."""
+    names = list(names)
+    numbers, remark = images.recognise_names(names)
+    if remark:
+        doubtful = DOUBT in remark
+        text = f"{folder}: files are {remark}" if doubtful else f"files {remark}"
+        (preview.notes if doubtful else preview.recognised).append(text)
+    if images.stems:
+        absent = [name for name in names if numbers.get(name) not in images.recorded]
+        note_unmatched(preview.notes, f"files in {folder}", absent)
 
 
 def note_unmatched(notes: list[str], what: str, names: list[str]) -> None:

@@ -30,6 +30,7 @@ from intercap_core.formats.detections.image_numbers import (
     note_broken,
     note_faults,
     note_unmatched,
+    preview_names,
     refuse_both,
     short_name,
     sort_by_image,
@@ -496,8 +497,7 @@ def preview_keypoints(
     whole = find_camera_file(folder, images.name)
     single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
     if whole is None and single is not None:
-        _, remark = images.recognise_names(single[0])
-        preview.recognised += [f"files {remark}"] if remark else []
+        preview_names(preview, folder / images.name, single[0], images)
     first = _load_first(folder, images.name, preview.notes)
     if first is None:
         return preview

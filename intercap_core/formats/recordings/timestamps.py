@@ -18,15 +18,23 @@ from intercap_core.formats.recordings.numbering import (
 )
 from intercap_core.inputs.files import quoted, read_text
 
-SUFFIXES = (".csv", ".txt")
+SUFFIXES = (".csv", ".txt", ".tsv")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
 Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
 
 
 def find_timestamps(stem: Path) -> Path | None:
-    """Return ``<stem>.csv`` or ``<stem>.txt``; None if neither exists."""
-    files = [stem.with_name(stem.name + suffix) for suffix in SUFFIXES]
-    return next((file for file in files if file.is_file()), None)
+    """Return ``<stem>.csv``, ``.txt`` or ``.tsv``, in any case; None if none exists.
+
+    Raises UserError if there are several.
+    """
+    folder = stem.parent
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    names = [f"{stem.name}{suffix}".lower() for suffix in SUFFIXES]
+    files = [path for path in entries if path.name.lower() in names and path.is_file()]
+    if len(files) > 1:
+        raise UserError(f"{folder}: has {files[0].name} and {files[1].name}; keep one")
+    return files[0] if files else None
 
 
 def read_timestamps(path: Path) -> Timestamps:
