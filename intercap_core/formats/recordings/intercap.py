@@ -75,7 +75,13 @@ class InterCapLayout(RecordingLayout):
         ]
         pose = self.extrinsics.master_from_colour[name]
         fps = frame_rate(sorted(colour))
-        return AlignedRecording(folder, name, lens, pose, shots=shots, fps=fps)
+        recording = AlignedRecording(folder, name, lens, pose, shots=shots, fps=fps)
+        recording.notes += [
+            f"the images in {unread.name}/ are not read, because another folder has its depth; "
+            "keep one of them"
+            for unread in _depth_folders(folder)[1:]
+        ]
+        return recording
 
 
 def frame_rate(numbers: list[int]) -> float:
@@ -102,11 +108,17 @@ def find_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
     """
     below = sorted(path for path in folder.iterdir() if path.is_dir())
     colour = next((path for path in below if COLOUR_FOLDER.fullmatch(path.name)), None)
-    depths = [path for path in below if DEPTH_FOLDER.fullmatch(path.name)]
-    depths.sort(key=lambda path: "align" not in path.name.lower())
+    depths = _depth_folders(folder)
     return _numbered(colour, (".jpg", ".jpeg", ".png")), _numbered(
         depths[0] if depths else None, (".png",)
     )
+
+
+def _depth_folders(folder: Path) -> list[Path]:
+    """Folders of depth that hold images, the one that is used first."""
+    below = sorted(path for path in folder.iterdir() if path.is_dir())
+    found = [path for path in below if DEPTH_FOLDER.fullmatch(path.name) and any(path.iterdir())]
+    return sorted(found, key=lambda path: "align" not in path.name.lower())
 
 
 def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -19,7 +19,7 @@ from intercap_core.inputs.files import describe_unread
 # that folder). A folder stands for all files below it.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.[mM][kK][vV]",),
-    "intercap": ("Frames_Cam*/*",),
+    "intercap": ("[fF][rR][aA][mM][eE][sS]_[cC][aA][mM]*/*",),
     "behave": ("",),
     "plain": (
         "*",
@@ -40,7 +40,11 @@ _READ: dict[LayoutName, tuple[str, str]] = {
         r"frames_cam\d{1,2}/(colou?r/\D*\d{1,9}\.(jpe?g|png)|depth[^/]*/\D*\d{1,9}\.png)",
         "Frames_Cam<n>/color/<number>.jpg (or .png) and depth/<number>.png",
     ),
-    "behave": (r"t\d{1,6}(\.\d{1,6})?/", "t<seconds>/k<n>.color.jpg and k<n>.depth.png"),
+    "behave": (  # the data set's other files, and its folders of fits, are left aside
+        r"(?-i:t)\d{1,6}(\.\d{1,6})?/"
+        r"(k\d{1,2}\.(color\.(jpe?g|png)|depth\.png)|(?!k\d{1,2}\.(color|depth)\.).+)",
+        "t<seconds>/k<n>.color.jpg (or .png) and k<n>.depth.png",
+    ),
     "plain": (
         r"{camera}(?-i:_timestamps){times}|{camera}(?-i:/timestamps){times}|{camera}{video}|"
         r"{camera}/({colour}/)?[^/]+{image}|{camera}/depth/[^/]+{depth}",
@@ -54,7 +58,8 @@ _READ: dict[LayoutName, tuple[str, str]] = {
 def list_unread(sequence: SequenceEntry) -> list[str]:
     """Notes on files in the folder of recordings that the layout does not read.
 
-    Files with suffixes of text and data, and hidden ones, are left out.
+    Files with suffixes of text and data, unless they are named after times, and hidden ones are
+    left out.
     """
     from intercap_core.formats.recordings import plain, timestamps
 
@@ -84,7 +89,7 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
             Path(folder, name)
             for name in sorted(names)
             if not name.startswith(".")
-            and Path(name).suffix.lower() not in _NO_RECORDINGS
+            and (Path(name).suffix.lower() not in _NO_RECORDINGS or "time" in name.lower())
             and not is_read.fullmatch(f"{place}{name}")
         ]
     advice = f"layout {sequence.layout} reads {expected}; rename, move or convert them"

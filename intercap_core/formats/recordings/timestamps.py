@@ -24,14 +24,14 @@ Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lin
 
 
 def find_timestamps(stem: Path) -> Path | None:
-    """Return ``<stem>.csv``, ``.txt`` or ``.tsv``, in any case; None if none exists.
+    """Return ``<stem>.csv``, ``.txt`` or ``.tsv``, suffixes in any case; None if none exists.
 
     Raises UserError if there are several.
     """
     folder = stem.parent
     entries = sorted(folder.iterdir()) if folder.is_dir() else []
-    names = [f"{stem.name}{suffix}".lower() for suffix in SUFFIXES]
-    files = [path for path in entries if path.name.lower() in names and path.is_file()]
+    named = [path for path in entries if path.stem == stem.name]
+    files = [path for path in named if path.suffix.lower() in SUFFIXES and path.is_file()]
     if len(files) > 1:
         raise UserError(f"{folder}: has {files[0].name} and {files[1].name}; keep one")
     return files[0] if files else None

@@ -20,7 +20,8 @@ def entry(folder: Path, layout: str) -> SequenceEntry:
 
 FILES = [
     "k1.mkv", "left/00000.jpg", "left/depth/00000.png", "right/colour/00000.jpg", "top.mp4",
-    "Frames_Cam1/color/00000.jpg", "Frames_Cam1/depth/00000.png", "t0000.000/k0.color.jpg",
+    "Frames_Cam1/color/00000.jpg", "frames_cam2/color/00000.jpg", "Frames_Cam1/depth/00000.png",
+    "t0000.000/k0.color.jpg",
 ]  # fmt: skip
 
 
@@ -28,7 +29,7 @@ FILES = [
     ("layout", "watched"),
     [
         ("k4a", {"k1.mkv"}),
-        ("intercap", {"Frames_Cam1/color", "Frames_Cam1/depth"}),
+        ("intercap", {"Frames_Cam1/color", "Frames_Cam1/depth", "frames_cam2/color"}),
         ("behave", {"."}),
         ("plain", {"left", "left/depth", "right", "right/colour", "top.mp4", "k1.mkv"}),
     ],

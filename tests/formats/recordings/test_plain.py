@@ -140,9 +140,9 @@ def test_hidden_files_are_ignored(capture):
 
 def test_timestamps_override_numbers(capture):
     times = 100 + np.arange(8) / 10 + 0.001 * np.arange(8)
-    for name in ("left", "top"):
+    for name, suffix in (("left", "TXT"), ("top", "tsv")):
         text = "\n".join(f"{value:.6f}" for value in times)
-        (capture.recordings / name / "timestamps.txt").write_text(text + "\n")
+        (capture.recordings / name / f"timestamps.{suffix}").write_text(text + "\n")
     named = "name,seconds\n" + "".join(f"{t:05d}.jpg,{times[t] + 0.002}\n" for t in range(8))
     (capture.recordings / "right" / "timestamps.csv").write_text(named)
     content = calibrated(right={"time_offset": 0.001})
@@ -396,6 +396,7 @@ def test_folders_and_suffixes_in_capitals_are_read(capture):
         ("left/image.webp", 1), ("left/depth/00000.exr", 3), ("left/depth_raw/00000.png", 8),
         ("cam 3.mp4", 1), ("caméra/00000.jpg", 2), ("top.mp4.bak", 1), ("left/video/left.mp4", 1),
         ("top.wmv", 1), ("left/times.csv", 1), ("left/a/b/c.png", 1),
+        ("left/times.txt", 1), ("top_timestamps.json", 1),
     ],
 )  # fmt: skip
 def test_files_that_nothing_reads_are_listed(capture, place, count):

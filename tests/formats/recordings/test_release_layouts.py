@@ -15,6 +15,7 @@ from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.recordings.layouts import list_unread, open_layout
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
@@ -226,6 +227,24 @@ def test_the_aligned_one_of_several_depth_folders_is_used(release):
     (cam(release, 2) / "depth").mkdir()
     with Frames.open(run(release)) as frames:
         assert frames.depth_available.all()
+    (cam(release, 2) / "depth" / "00000.png").touch()
+    with open_layout(release).open("k2") as recording:
+        assert "the images in depth/ are not read" in recording.notes[0]
+
+
+def test_files_beside_those_of_behave_are_listed(behave):
+    first = next(path for path in sorted(behave.recordings.iterdir()) if path.is_dir())
+    for name in (
+        "k0.depth.tiff",
+        "k1.person_mask.jpg",
+        "k1.color.json",
+        "../T0009.000/k0.color.jpg",
+    ):
+        (first / name).parent.mkdir(exist_ok=True)
+        (first / name).touch()
+    notes = list_unread(behave)
+    assert len(notes) == 2 and "T0009.000/k0.color.jpg is not used" in notes[0]
+    assert "k0.depth.tiff is not used" in notes[1]
 
 
 def calibration_of_another_resolution(sequence):
