@@ -47,6 +47,7 @@ from intercap_core.inputs.files import UnreadableFile, check_file
 # FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
 LATEST_US = 10**15  # of a device's clock: thirty years; later times are damage
+_REMOVE_ROTATION = "remove the rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
 # Exif orientation by the matrix [a b; c d] of a track, with x' = a x + c y and y' = b x + d y.
 # Source: ISO/IEC 14496-12, 8.3.2.
 _ORIENTATIONS = {
@@ -143,11 +144,14 @@ class _FirstImage(NamedTuple):
 
 
 def _first_image(container: Any, stream: Any) -> _FirstImage | None:
-    """Properties of the first image that decodes; None if no image does."""
+    """Properties of the first image that decodes; None if no image does.
+
+    Raises :class:`DamagedImage` as :func:`_orientation` does.
+    """
     for number, packet in enumerate(demux(container, stream, lambda: None)):
         if number > 60:  # two seconds, within which an image must decode
             break
-        with contextlib.suppress(av.error.FFmpegError, OSError, DamagedImage):
+        with contextlib.suppress(av.error.FFmpegError, OSError):
             for frame in packet.decode():
                 orientation, size = _orientation(frame), (frame.width, frame.height)
                 # Packets of interlaced videos hold two JPEG files, each with half of the rows.
@@ -253,13 +257,22 @@ def _decode_frames(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def read_video_size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a video's images as shown; None if none can be decoded."""
+    """Width and height of a video's images as shown; None if none can be decoded.
+
+    Raises UserError for a rotation by other than quarter turns.
+    """
     try:
         with open_container(path) as container:
             first = _first_image(container, container.streams.video[0])
             return None if first is None else first.size
+    except DamagedImage as error:
+        raise _impossible_rotation(path, error) from None
     except (UnreadableFile, av.error.FFmpegError, OSError, IndexError):
         return None
+
+
+def _impossible_rotation(path: Path, error: DamagedImage) -> UserError:
+    return UserError(f"{path}: {error}; {_REMOVE_ROTATION}")
 
 
 class VideoRecording(CameraRecording):
@@ -306,9 +319,12 @@ class VideoRecording(CameraRecording):
             if depth and orientation in (2, 3, 4):
                 raise UserError(
                     f"{path}: states a half turn or a mirror (orientation {orientation}), which "
-                    "its depth files would not follow; turn the video itself, or remove the "
-                    "rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
+                    "its depth files would not follow; turn the video itself, or "
+                    f"{_REMOVE_ROTATION}"
                 )
+        except DamagedImage as error:
+            self._container.close()
+            raise _impossible_rotation(path, error) from None
         except UserError:
             self._container.close()
             raise
@@ -328,6 +344,12 @@ class VideoRecording(CameraRecording):
             source=path.with_suffix(""),
             images=int(self._stream.frames),
         )
+        if orientation != 1:
+            mirrored = ", and mirrored, which OpenCV does not do" * (orientation in (2, 4, 5, 7))
+            self.notes.append(
+                f"the video states orientation {orientation}: its images are stored turned by it"
+                f"{mirrored}; calibrate and detect on such images"
+            )
         self._damaged = 0
         self._first_s: float | None = None  # time of the first image on the file's clock
 

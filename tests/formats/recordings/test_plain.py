@@ -338,12 +338,12 @@ def test_a_recording_without_times_is_refused(capture):
         run(capture)
 
 
-def states_matrix(path: Path, matrix: tuple[int, int, int, int]) -> None:
+def states_matrix(path: Path, matrix: tuple[float, float, float, float]) -> None:
     """Write the display matrix [a b; c d] into the header of an MP4 file."""
     content = bytearray(path.read_bytes())
     at = content.index(b"tkhd") + 4 + 40
     one = 1 << 16
-    a, b, c, d = (one * value for value in matrix)
+    a, b, c, d = (round(one * value) for value in matrix)
     content[at : at + 36] = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
     path.write_bytes(content)
 
@@ -365,9 +365,22 @@ def test_video_is_stored_as_it_is_shown(capture, codec, matrix, orientation):
     assert read_video_size(path) == expected.shape[1::-1]
     with open_layout(capture).open("top") as recording:
         assert recording.preview().size == expected.shape[1::-1]
+        (note,) = recording.notes
+        assert f"orientation {orientation}" in note and ("mirrored" in note) == (orientation == 2)
         image = next(iter(recording.images()))
     shown = cv2.imdecode(np.frombuffer(image.content, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(shown.astype(int) - expected).mean() < 5
+
+
+@pytest.mark.parametrize("matrix", [(0.7071, 0.7071, -0.7071, 0.7071), (0, 0, 0, 0)])
+def test_a_video_turned_by_other_than_quarter_turns_is_refused(capture, matrix):
+    path = capture.recordings / "top.mp4"
+    remove_images(capture, "top/*")
+    write_video(path, pictures(2, 1), "mpeg4", fps=FPS)
+    states_matrix(path, matrix)
+    for read in (read_video_size, lambda path: open_layout(capture).open("top")):
+        with pytest.raises(UserError, match=r"top\.mp4: states a rotation.*expected quarter turns"):
+            read(path)
 
 
 def test_a_video_turned_by_half_with_depth_is_refused(capture):
