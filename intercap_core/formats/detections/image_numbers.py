@@ -108,7 +108,8 @@ class CameraImages:
         """
         by_name, remark = self.recognise_names(names)
         matched, remark_on_ids = self.match_numbers(ids)
-        by_id = {n: n for n in ids} if matched is None else matched
+        unmatched: dict[float, int] = {n: n for n in ids}
+        by_id = unmatched if matched is None else matched
         known_ids = self.recorded.intersection(by_id.values())
         known_names = self.recorded.intersection(by_name.values())
         if (len(known_ids), bool(remark)) > (len(known_names), bool(remark_on_ids)):
@@ -149,7 +150,8 @@ class CameraImages:
         if share >= MIN_SHARE_SHIFTED and begins_at_1:
             return {n: int(n) - 1 for n in given}, "numbered from 1"
         images = sorted(self.recorded)
-        for numbers_of_images in (dict(zip(images, images, strict=True)), named):
+        positions: dict[float, int] = {n: n for n in images}
+        for numbers_of_images in (positions, named):
             shifted = self._match_shifted(numbers_of_images, given)
             if shifted is not None:
                 return shifted, f"numbered from {given[0]:.0f}"
