@@ -52,6 +52,11 @@ def flat(number: int, c: int) -> np.ndarray:
     return np.full((LENS.height, LENS.width), 2000 + c, np.uint16)
 
 
+def write_keypoints(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / "0_keypoints.json").write_text('{"people": []}')
+
+
 @pytest.fixture
 def release(tmp_path, monkeypatch) -> Path:
     """Three sequences, of which one annotation folder too many, and one without recordings."""
@@ -68,9 +73,7 @@ def release(tmp_path, monkeypatch) -> Path:
             root, rig, numbers=numbers, colour=colour, depth=flat, sequence=sequence,
             calibration=calibration,
         )  # fmt: skip
-        folder = root / "keypoints" / sequence / "k1"
-        folder.mkdir(parents=True)
-        (folder / "0_keypoints.json").write_text('{"people": []}')
+        write_keypoints(root / "keypoints" / sequence / "k1")
     annotate(root, "subject01_motion03_seg1", contact="3\n6\n\n10\n400\n\n")
     annotate(root, "subject01_motion03_seg1_v2", contact="2\n5\n")
     annotate(root, "subject03_motion09_seg0", contact="4\n7\n", frame=3)
@@ -164,7 +167,7 @@ def test_poses_are_left_out_without_the_releases_meshes(release, given):
 
 def test_detections_are_found_by_usual_names(release, tmp_path):
     for name in ("s01_o03_seg1", "03/09/Seg_0", "subject09_motion03_seg00"):
-        (tmp_path / "kp" / name / "k1").mkdir(parents=True)
+        write_keypoints(tmp_path / "kp" / name / "k1")
     write("--keypoints", "kp")
     project = load_project(Path("config/intercap/config.yaml"))
     found = [row.keypoints for row in project.sequences.values()]
@@ -293,7 +296,7 @@ def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
     choice = choose_calibration(sequence, folders)
     assert choice.best == "third" and choice.residual_m["third"] < 0.7 * choice.residual_m["first"]
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "kp" / "04/05/Seg_0" / "k1").mkdir(parents=True)
+    write_keypoints(tmp_path / "kp" / "04/05/Seg_0" / "k1")
     objects = str(ROOT / "config/objects.yaml")
     done = tables("InterCap", "--output", "out", "--objects", objects, "--keypoints", "kp")
     assert done.exit_code == 0
