@@ -45,9 +45,10 @@ def _load():
 
 
 # The environment is installed from the folder that holds `.snakemake`.
-if DeploymentMethod.CONDA in workflow.deployment_settings.deployment_method and Path(
-    "pyproject.toml"
-).resolve() != shipped("pyproject.toml"):
+CHECKOUT = shipped("pyproject.toml")
+if DeploymentMethod.CONDA in workflow.deployment_settings.deployment_method and not (
+    CHECKOUT.is_file() and CHECKOUT.parent == Path.cwd()
+):
     raise WorkflowError(
         "--sdm conda installs the environment from a checkout, expected as the working directory: "
         f"{Path.cwd()} is none; leave the option out to use the environment of this program"
