@@ -323,7 +323,7 @@ class SequenceList:
                 measured.append(summary)
                 entry |= {
                     "frames": len(summary),
-                    "flagged": int(summary.values["flagged"].any(axis=1).sum()),
+                    "flagged": summary.values["flagged"].sum(axis=0).tolist(),  # by part
                     "errors": {
                         e.part: round(e.stated, 1) if e.stated == e.stated else None
                         for e in stated_errors(summary)

@@ -11,16 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.sides import sides_of
 from intercap_core.annotation import ANY_REGION, Annotation
+from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges, runs
 from intercap_core.flags import Flags
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.person.sides import images_with_stated_sides
 from intercap_core.schemas import FRAMES, JOINT, PERSON, SCENE
 
 TOUCHING = 0.5  # least probability of contact in the result, as on the timeline
 _OF_CONTACT = " annotated "  # in the joint fit's reasons of flags that concern annotated contact
-_STALE = "the result was computed before this edit: run the stale stages"
+_STALE = "the result was computed before this edit: recompute the outdated stages"
 
 
 def list_edits(opened: Opened, annotation: Annotation) -> list[dict[str, Any]]:
@@ -31,8 +34,8 @@ def list_edits(opened: Opened, annotation: Annotation) -> list[dict[str, Any]]:
     Sections whose stage has no readable result are left out.
     """
     entries: list[dict[str, Any]] = []
-    for of_section in (_contact, _poses, _floor, _subject, _dropped):
-        with contextlib.suppress(artefacts.Unreadable):
+    for of_section in (_contact, _poses, _floor, _subject, _left_right, _dropped):
+        with contextlib.suppress(UserError):
             entries += of_section(opened, annotation)
     return sorted(entries, key=lambda entry: entry["same"])
 
@@ -59,8 +62,8 @@ def _contact(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]
     )
     if not annotation.contact:
         count = int((probability.max(1) >= TOUCHING).sum())
-        result = "nothing touches" if not count else f"contact in {count} frames"
-        yield _entry("contact", 0, "nothing touches", result, same=not count, why=_STALE)
+        result = "no contact" if not count else f"contact in {count} frames"
+        yield _entry("contact", 0, "no contact at all", result, same=not count, why=_STALE)
     for part in sorted({interval.part for interval in annotation.contact}):
         intervals = [interval for interval in annotation.contact if interval.part == part]
         stated = np.zeros(len(probability), bool)
@@ -77,7 +80,7 @@ def _contact(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]
             if stale:
                 why = _STALE
             elif not same and not why:
-                why = "the observed distance decides at uncertain ends and if no part is named"
+                why = "uncertain end: moved by the fit to where the surfaces part"
             yield _entry(
                 "contact", first, f"{part.replace('_', ' ')}: frames {first} to {last}", result,
                 same=same and not why, why=why,
@@ -146,6 +149,25 @@ def _subject(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]
         "this person" if chosen_by == "named" else f"chosen otherwise ({chosen_by})",
         same=chosen_by == "named", why=doubts or _STALE,
     )  # fmt: skip
+
+
+def _left_right(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]:
+    """Report in how many images stage person swapped the limbs as annotated."""
+    if not annotation.left_right:
+        return
+    sides = sides_of(opened)
+    visible = (sides.exchanged >= 0).any(axis=2)  # (T, C)
+    swapped = (sides.exchanged != 0).all(axis=2)
+    for entry in annotation.left_right:
+        images = images_with_stated_sides([entry], sides.cameras, sides.image_of, opened.name)
+        count, agree = int((images & visible).sum()), int((images & visible & swapped).sum())
+        yield _entry(
+            "left_right", int(images.any(axis=1).argmax()),
+            f"swapped in {entry.camera or 'all views'}: frames {entry.start} to {entry.end - 1}",
+            f"swapped in {agree} of {count} images", same=agree == count,
+            why="the other views contradict the annotation in the other images, or the result was "
+            "computed before this edit",
+        )  # fmt: skip
 
 
 def _dropped(opened: Opened, annotation: Annotation) -> Iterator[dict[str, Any]]:

@@ -219,7 +219,7 @@ def _track(opened: Opened, info: dict[str, Any]) -> None:
         }
         if not info["track"]["object"]:
             return
-        info["places"] += _runs(track["lost"], "object", "the object is lost", 3.0)
+        info["places"] += _runs(track["lost"], "object", _LOST, 3.0)
         message = "the rotation of the object is ambiguous"
         info["places"] += _runs(track["ambiguous"], "object", message, 2.0)
 
@@ -268,10 +268,14 @@ def _metrics(opened: Opened, info: dict[str, Any]) -> None:
             ]  # fmt: skip
             for p, part in enumerate(parts):
                 info["places"] += _doubtful(part, float(error[p]), by_frame[p])
+    lost = set(info.get("track", {}).get("lost", ()))
+    info["places"] = [place for place in info["places"] if place["message"] != _LOST]  # are flagged
     for first, last, reason in info["flags"]:
-        info["places"].append(_place(first, last, "flag", f"flagged: {reason}", 1.5))
+        weight = 3.0 if lost.intersection(range(first, last + 1)) else 1.5
+        info["places"].append(_place(first, last, "flag", f"not reliable: {reason}", weight))
 
 
+_LOST = "the object is lost"
 _Reader = Callable[[Opened, dict[str, Any]], Rig | None]
 # Reader of each stage, schema, and a dataset with a row per frame
 _READERS: dict[str, tuple[_Reader, artefacts.Schema, str]] = {

@@ -76,7 +76,7 @@ def annotate(
     ] = None,
     show: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
-    ] = False,
+    ] = True,
 ) -> None:
     """Correct annotations in the browser: view results over the images, edit, re-run stages.
 

@@ -265,7 +265,6 @@ def run_dataset(project: Project) -> Path:
             results=folder,
             card=project.config.card,
             formats=project.config.export.formats,
-            virtual=all(project.recordings_made(name) is not None for name in project.sequences),
             failed=failed,
             changed=changed(project.config),
         )

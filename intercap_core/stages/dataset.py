@@ -40,7 +40,6 @@ def run(
     results: Path,
     card: CardSettings,
     formats: Sequence[str],
-    virtual: bool = False,
     failed: Mapping[str, str] | None = None,
     changed: Sequence[tuple[str, str, str]] = (),
 ) -> Path:
@@ -57,7 +56,6 @@ def run(
         results: folder of the outputs, which ``pipeline.plan.DATASET_OUTPUTS`` lists.
         card: statements of the dataset card.
         formats: formats of the exports, for the card.
-        virtual: True if the studio rendered all recordings.
         failed: for sequences without a result, the reason.
         changed: name, value and default of each setting that differs from its default.
     """
@@ -103,9 +101,7 @@ def run(
         log.warning("sequence %s: %s", name, why)
     _write_heatmaps(results / "heatmaps.h5", dataset, heat)
     _replace(results / "summary.json", _json(figures.summary(dataset, measured)))
-    stated = facts(
-        dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual
-    )
+    stated = facts(dataset, card, found, groups, formats=formats, failed=unreported)
     _replace(results / "card.md", markdown(stated))
     _replace(results / "card.json", _json(stated))
     _replace(results / "croissant.json", _json(croissant(stated, results, written)))

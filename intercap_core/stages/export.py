@@ -156,6 +156,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
         None if mesh is None else ContactVertices.read(paths.metrics, motion, mesh),
         None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
         motion.made_by,
+        measured.has_truth,
     )
 
 

@@ -132,10 +132,14 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
     if "made_by" in joint.attributes:
         return (
             f"Not fitted here: made by {joint.attributes['made_by']}, with the cameras as they "
-            "were given. The sequential fits are this program's."
+            "were given. The per-stage fits are this program's."
         )
     steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
-    end = "converged" if joint.attributes["converged"] else "iteration limit reached"
+    end = (
+        "converged"
+        if joint.attributes["converged"]
+        else "stopped at the iteration limit before convergence"
+    )
     if "last_step_mm" in joint.attributes:
         end += f" (last step {joint.attributes['last_step_mm']:.2g} mm)"
     corrected = ""
@@ -151,18 +155,18 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
         variance = np.einsum("cici->ci", joint["camera_covariance"])
         sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # standard deviation of the translation
         cameras = ", ".join(
-            f"{rig.names[c]} {1e3 * moved[c]:.1f} (+- {1e3 * sigma[c]:.1f})"
+            f"{rig.names[c]} {1e3 * moved[c]:.1f} ± {1e3 * sigma[c]:.1f}"
             for c in order
             if sigma[c] > 0
         )
-        corrected = f"; cameras corrected, mm over 2 m: {cameras}"
+        corrected = f"; cameras moved by the joint fit, mm (mean displacement at 2 m): {cameras}"
     frames = joint["hand_undetermined"].sum(axis=0)
     hands = "".join(
-        f" The {side} hand is undetermined in {count} frames."
+        f" Too few observations of the {side} hand in {count} frames."
         for side, count in zip(("left", "right"), frames, strict=True)
         if count
     )
-    return f"Joint fit: {steps} steps taken, {refused} refused, {end}{corrected}.{hands}"
+    return f"Joint fit: {steps} solver steps accepted, {refused} rejected, {end}{corrected}.{hands}"
 
 
 def _energies(joint: Artefact) -> list[tuple[str, float, float]]:

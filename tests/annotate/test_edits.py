@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.annotate.edits import list_edits
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotation import Annotation
-from tests.annotate.served import artefact
+from tests.annotate.served import artefact, detect
 
 
 def _fitted(settings: Path, touching: slice, labels: slice, reason: str = "") -> None:
@@ -53,6 +53,7 @@ def test_contact(
 
 def test_all_sections_differing_entries_first(opened: Opened, settings: Path) -> None:
     _fitted(settings, slice(0, 0), slice(0, 0))
+    detect(settings, {"k1": [1]})
     with h5py.File(artefact(settings, "joint")) as file:
         vectors = Rotation.from_matrix(file["rotation"][:]).as_rotvec()
         places = file["translation"][:].astype(float)
@@ -70,14 +71,17 @@ def test_all_sections_differing_entries_first(opened: Opened, settings: Path) ->
                 "floor": [[0, 1, 2], [1, 1, 2], [0, 1, 3]],
                 "subject": [{"camera": "k1", "x": 5, "y": 5}],
                 "drop_frames": [5],
+                "left_right": [{"camera": "k1", "start": 1, "end": 3}],
             }
         ),
     )
     assert [(entry["section"], entry["frame"], entry["same"]) for entry in found] == [
         ("object_poses", 3, False), ("floor", 0, False), ("subject", 0, False),
-        ("drop_frames", 5, False), ("contact", 0, True), ("object_poses", 2, True),
+        ("left_right", 1, False), ("drop_frames", 5, False),
+        ("contact", 0, True), ("object_poses", 2, True),
     ]  # fmt: skip
     assert found[0]["result"] == "50 mm and 0° away" and "10 mm" in found[0]["why"]
+    assert found[3]["result"] == "swapped in 1 of 2 images"
 
 
 def test_without_results_there_are_no_entries(opened: Opened, settings: Path) -> None:

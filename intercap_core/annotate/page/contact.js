@@ -99,7 +99,7 @@ export class Contact {
     this.selected = null;
     const { all, unconfirmed } = this.#editable(), kept = all.filter((other) => id(other) !== id(interval));
     this.#store(kept, unconfirmed, "contact deleted");
-    if (!kept.length) this.app.say("The annotation now states that nothing touches. \"Use the estimate\" removes this statement.");
+    if (!kept.length) this.app.say("Annotated: no contact at all. \"Discard, use the estimate\" removes this.");
   }
 
   split(interval, frame) {
@@ -111,14 +111,15 @@ export class Contact {
     this.#store([...others, ...parts], unconfirmed, "contact split");
   }
 
-  /* Add contact; overlapping intervals of the part are merged. */
-  add(part, start, end) {
+  /* Add contact; overlapping intervals of the part are merged. Ends of `start` to `end` are exact, or those that
+   * `uncertain` names are not; ends of an overlapping interval keep their state. */
+  add(part, start, end, uncertain = null) {
     const { all, unconfirmed } = this.#editable();
     const overlapping = all.filter((other) => other.part === part && other.start < end && other.end > start);
-    const added = {
-      part, start: Math.min(start, ...overlapping.map((other) => other.start)),
-      end: Math.max(end, ...overlapping.map((other) => other.end)),
-    };
+    const parts = [...overlapping, { part, start, end, uncertain }];
+    const first = parts.reduce((a, b) => (b.start < a.start ? b : a)), last = parts.reduce((a, b) => (b.end > a.end ? b : a));
+    const open = [isUncertain(first, "start") && "start", isUncertain(last, "end") && "end"].filter(Boolean);
+    const added = { part, start: first.start, end: last.end, ...(open.length && { uncertain: open.length === 2 ? "both" : open[0] }) };
     this.selected = added;
     unconfirmed.delete(id(added));
     this.#store([...all.filter((other) => !overlapping.includes(other)), added], unconfirmed, "contact added");
@@ -138,7 +139,7 @@ export class Contact {
   /* State that no part touches in the whole sequence, by an empty list. */
   stateNone() {
     this.selected = null;
-    this.#store([], new Set(), "nothing touches");
+    this.#store([], new Set(), "no contact at all");
   }
 
   /* Remove contact from the annotation, so that the program estimates it. */

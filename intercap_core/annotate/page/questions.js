@@ -68,7 +68,7 @@ export class Questions {
     const sections = EDITED_SECTIONS[question.kind], before = this.#values(sections);
     const pending = { answered, sections, before, steps: draft.undoSteps.length + (mode ? 1 : 0) };
     if (edits) this.pending.push(pending); // before the edit, which notifies the listener above
-    if (question.kind === "contact" && answer === "yes") contact.add(question.part, question.first, question.last + 1);
+    if (question.kind === "contact" && answer === "yes") contact.add(question.part, question.first, question.last + 1, "both");
     if (question.kind === "contact" && answer === "no") contact.clear(question.part, question.first, question.last + 1);
     if (question.kind === "turn" && answer === "yes" && pose?.resultAt(question.frame)) {
       putPose(draft, question.frame, pose.resultAt(question.frame), "rotation confirmed");

@@ -269,6 +269,8 @@ class About:
     """Standard deviations; None for imported results, which state none."""
     made_by: str = ""
     """The other program that made an imported result."""
+    virtual: bool = False
+    """The recording is virtual: its ground truth is known."""
 
     def to_json(self, coordinates: Coordinates) -> dict[str, Any]:
         """Serialize for JSON next to numbers in these ``coordinates``."""

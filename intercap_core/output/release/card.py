@@ -27,6 +27,7 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.flags import PARTS
+from intercap_core.output.site.measures import covered
 from intercap_core.versions import versions
 
 Facts = dict[str, Any]
@@ -51,9 +52,10 @@ CONVENTIONS = {
     "body": "parameters in SMPL-X's order for the named body file; with another file, the same "
     "parameters give another person",
     "contact": "probability by frame and body region that it touches the object",
-    "flags": "frames that the program does not trust, with reasons; exclude them",
-    "errors": "estimated without ground truth, by cameras held out: the true error is "
-    "within the factor in four of five cases",
+    "flags": "by frame and part (body, hands, object, contact), with reasons; exclude only the "
+    "flagged parts that you use",
+    "errors": "estimated without ground truth, by cameras held out; the factor gives a range that "
+    "contains most true errors",
 }
 FORMATS = {
     "intercap": "*/export/intercap/res.pkl and res.npz: as the InterCap release",
@@ -76,7 +78,6 @@ def facts(
     *,
     formats: Sequence[str],
     failed: Mapping[str, str],
-    virtual: bool,
 ) -> Facts:
     """Return the content of the card for JSON.
 
@@ -84,7 +85,6 @@ def facts(
         groups: tables by "objects", "subjects" and "intents".
         formats: formats of the exports.
         failed: sequences without a result, with the reason.
-        virtual: the studio made all recordings.
     """
     measured = [s.metrics for s in summaries]
     frames = sum(len(s) for s in measured)
@@ -99,7 +99,7 @@ def facts(
         "url": settings.url,
         "citation": settings.citation,
         "published": settings.published.isoformat() if settings.published else "",
-        "virtual": virtual,
+        "virtual": all(s.has_truth for s in measured),
         "counts": {
             "sequences": len(measured),
             "frames": frames,
@@ -214,6 +214,10 @@ def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
         keys = ("body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "object_translation_mm",
                 "object_rotation_deg", "contact_region_f1")  # fmt: skip
         accuracy["against_truth"] = {key: _plain(true[key]) for key in keys if key in true}
+        accuracy["in_range"] = {
+            part: {"true_errors_in_range": inside, "of": count}
+            for part, inside, count in covered(measured)
+        }
     return accuracy
 
 

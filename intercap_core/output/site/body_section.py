@@ -100,7 +100,7 @@ def _timeline(states: list[str], cloud_mm: np.ndarray, keypoint_px: np.ndarray, 
     ]
     label = ", ".join(counts) or "no doubtful frame"
     if np.isfinite(cloud_mm).any():
-        label += f" · points {np.nanmedian(cloud_mm):.1f} mm off"
+        label += f" · median distance to point cloud {np.nanmedian(cloud_mm):.1f} mm"
     rows = [charts.TimelineRow("fit", charts.state_runs(states, FIT_STATES), label)]
     for camera, pixels in zip(rig, keypoint_px.T, strict=True):
         visible = np.isfinite(pixels)

@@ -26,7 +26,7 @@ _MAX_PAIRS = 45  # drawn pairs of cameras
 STATES = {  # of a camera in a frame set
     "recorded": "recorded",
     "part": "only one of colour and depth",
-    "slipped": "shows an earlier frame",
+    "slipped": "shows an earlier frame (images lost)",
     "missing": "no image",
     "dropped": "dropped by annotation",
 }
@@ -216,7 +216,7 @@ def _row_label(states: Sequence[str], slip: np.ndarray, times: np.ndarray, delay
     late = sorted({int(slip[t]) for t, state in enumerate(states) if state == "slipped"})
     words = {
         "missing": "missing",
-        "slipped": f"slipped by {' or '.join(map(str, late))}",
+        "slipped": f"earlier by {' or '.join(map(str, late))}",
         "part": "incomplete",
     }
     parts = [f"{times[0]:.2f}–{times[-1]:.2f} s"]
@@ -261,4 +261,4 @@ def _colour(c: int) -> str:
 
 
 def _sets(count: int) -> str:
-    return "set" if count == 1 else "sets"
+    return "frame" if count == 1 else "frames"

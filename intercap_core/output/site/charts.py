@@ -190,7 +190,7 @@ class BarPair:
     def change(cls, name: str, before: float, after: float, note: str, weak: bool) -> BarPair:
         """Return a pair that is labelled with both values."""
         values = " → ".join(f"{v:.1f}" if math.isfinite(v) else "–" for v in (before, after))
-        label = f"{values}{f'  ·  {note}' if note else ''}{', weak' if weak else ''}"
+        label = f"{values}{f'  ·  {note}' if note else ''}{', little overlap' if weak else ''}"
         return cls(name, before, after, label, weak)
 
 

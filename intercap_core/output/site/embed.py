@@ -11,7 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from intercap_core.flags import Flags
+from intercap_core.flags import OF_OBJECT, PARTS, Flags
 from intercap_core.output.site.drawing import EncodedImage
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -59,12 +59,13 @@ def tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) 
     return {"name": name, "value": text, "note": note}
 
 
-def flag_tile(flags: Flags) -> dict[str, str]:
+def flag_tile(flags: Flags, *, has_object: bool) -> dict[str, str]:
     """Return the share of frames with a flag of the body, and in words those of other parts."""
     shares = {part: 100 * share for part, share in flags.shares().items()}
-    body = shares.pop("body")
-    others = ", ".join(f"{part} {share:.0f} %" for part, share in shares.items())
-    return tile("body flagged", body, "%", others)
+    others = ", ".join(
+        f"{part} {shares[part]:.0f} %" for part in PARTS[1:] if has_object or part not in OF_OBJECT
+    )
+    return tile("frames with unreliable body", shares["body"], "%", f"unreliable: {others}")
 
 
 def span(first: int, last: int) -> str:

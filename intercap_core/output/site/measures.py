@@ -231,7 +231,9 @@ def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str,
     rows = [{"name": dataset, "cells": [measured[n] for n in names], "reference": False}]
     if floor:
         cells = [floor.get(n) for n in names]
-        rows.append({"name": "true poses", "cells": cells, "reference": True})
+        rows.append(
+            {"name": "ground-truth surfaces (noise floor)", "cells": cells, "reference": True}
+        )
     if not any(s.has_truth for s in sequences):
         published = [*_PUBLISHED_CLOUD_MM, None, None]
         rows.append({"name": "InterCap, as published", "cells": published, "reference": True})

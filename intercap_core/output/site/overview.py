@@ -28,25 +28,25 @@ _FIGURES = {
     "acceleration_body_mm": ("acceleration, body", "mm/frame²"),
     "acceleration_object_mm": ("acceleration, object", "mm/frame²"),
     "penetration.mean_mm": ("penetration", "mean, mm"),
-    "penetration.p98_mm": ("penetration", "p98, mm"),
-    "vertex_to_cloud.body_visible_mm": ("body to cloud", "visible, mm"),
-    "vertex_to_cloud.object_visible_mm": ("object to cloud", "visible, mm"),
+    "penetration.p98_mm": ("penetration", "98th percentile, mm"),
+    "vertex_to_cloud.body_visible_mm": ("body to point cloud", "visible, mm"),
+    "vertex_to_cloud.object_visible_mm": ("object to point cloud", "visible, mm"),
     "verdict.body_mm": ("body", "est. error, mm"),
     "verdict.hands_mm": ("hands", "est. error, mm"),
     "verdict.object_mm": ("object", "est. error, mm"),
-    "joint.body_pve_mm": ("body PVE", "mm, truth"),
-    "joint.hand_mpjpe_mm": ("hands", "mm, truth"),
-    "joint.object_translation_mm": ("object", "mm, truth"),
-    "joint.object_rotation_deg": ("object", "deg, truth"),
-    "joint.contact_region_f1": ("contact", "F1, truth"),
+    "joint.body_pve_mm": ("body PVE", "mm, ground truth"),
+    "joint.hand_mpjpe_mm": ("hands", "mm, ground truth"),
+    "joint.object_translation_mm": ("object", "mm, ground truth"),
+    "joint.object_rotation_deg": ("object", "deg, ground truth"),
+    "joint.contact_region_f1": ("contact", "F1, ground truth"),
     "verdict.keypoint_px": ("keypoints", "px"),
-    "verdict.keypoint_px_held_out": ("keypoints", "held out, px"),
+    "verdict.keypoint_px_held_out": ("keypoints", "without this camera, px"),
     "verdict.person_mm": ("person's points", "mm"),
-    "verdict.person_held_out_mm": ("person's points", "held out, mm"),
+    "verdict.person_held_out_mm": ("person's points", "without this camera, mm"),
     "verdict.overlap": ("object's mask", "IoU"),
-    "verdict.overlap_held_out": ("object's mask", "held out, IoU"),
+    "verdict.overlap_held_out": ("object's mask", "without this camera, IoU"),
     "verdict.object_depth_mm": ("object's depth", "mm"),
-    "verdict.object_depth_held_out_mm": ("object's depth", "held out, mm"),
+    "verdict.object_depth_held_out_mm": ("object's depth", "without this camera, mm"),
 }
 
 
@@ -109,6 +109,7 @@ def page(content: DatasetContent) -> str:
         "headline": _headline(content, measured),
         "virtual": sum(s.has_truth for s in measured),
         "tiles": _tiles(measured),
+        "parts": PARTS if any(s.has_object for s in measured) else PARTS[:2],
         "rows": sorted(rows, key=lambda row: row["rank"]),
         "filters": {
             name: sorted({row[name] for row in rows if row[name]})
@@ -150,7 +151,7 @@ def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> s
     ]
     imported = sum(bool(s.made_by) for s in measured)
     if imported:
-        parts.append(f"{imported} with results of another program")
+        parts.append(f"{imported} with imported results")
     if content.failed:
         parts.append(f"{len(content.failed)} failed")
     return ", ".join(parts)
@@ -163,11 +164,11 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     if any(s.has_truth for s in measured):
         joint = figures.truth_figures(measured, "joint")
         for key, name, unit, note in (
-            ("body_pve_mm", "body error", "mm", "mean over vertices, against truth"),
+            ("body_pve_mm", "body error", "mm", "mean over vertices, against ground truth"),
             ("object_translation_mm", "object error", "mm", "median of the centre"),
             ("object_rotation_deg", "object rotation error", "°", "median"),
-            ("contact_region_f1", "contact, F1 by region", "", "of the body, against truth"),
-            ("contact_f1", "contact, F1 by vertex", "", "at 4.5 mm, against truth"),
+            ("contact_region_f1", "contact, F1 by region", "", "of the body, against ground truth"),
+            ("contact_f1", "contact, F1 by vertex", "", "at 4.5 mm, against ground truth"),
         ):
             if key in joint:
                 worst = _worst_object(measured, key, unit) if key.startswith("object") else ""
@@ -183,10 +184,12 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     handling = any(s.has_object for s in measured)
     if handling:
         tiles.append(tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"))
-    tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
+    tiles.append(tile("body to point cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if handling:
-        tiles.append(tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
-    return [*tiles, flag_tile(figures.pooled_flags(measured))]
+        tiles.append(
+            tile("object to point cloud", cloud["object_visible_mm"], "mm", "visible surface")
+        )
+    return [*tiles, flag_tile(figures.pooled_flags(measured), has_object=handling)]
 
 
 def _worst_object(measured: Sequence[SequenceMetrics], key: str, unit: str) -> str:

@@ -64,7 +64,7 @@ def page(content: SequenceContent) -> str:
     for overlay in content.overlays:
         caption = f"camera {overlay.camera}, frame {overlay.frame}"
         if why := flagged[overlay.frame]:
-            caption += f" (flagged: {why})"
+            caption += f", not reliable: {why}"
         cameras.setdefault(overlay.camera, []).append(embedded(overlay.image, caption))
     context = {
         "name": s.name,
@@ -127,20 +127,22 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
     if s.has_truth:
         errors = figures.truth_figures([s], "joint")
         tiles.append(
-            tile("body error", errors.get("body_pve_mm"), "mm", "per vertex, against truth")
+            tile("body error", errors.get("body_pve_mm"), "mm", "per vertex, against ground truth")
         )
         if s.has_object:
             centre = errors.get("object_translation_mm")
-            tiles.append(tile("object error", centre, "mm", "centre, median, against truth"))
+            tiles.append(tile("object error", centre, "mm", "centre, median, against ground truth"))
     cloud = figures.cloud_figures([s])
-    tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
+    tiles.append(tile("body to point cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if s.has_object:
-        tiles.append(tile("object to cloud", cloud["object_visible_mm"], "mm", "visible surface"))
+        tiles.append(
+            tile("object to point cloud", cloud["object_visible_mm"], "mm", "visible surface")
+        )
         depth = figures.penetration_figures([s]).get("mean_mm")
         tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
         share = 100 * float(s.values["contact_frame"].mean())
         tiles.append(tile("in contact", share, "%", "of the frames", 0))
-    return [*tiles, flag_tile(s.flags)]
+    return [*tiles, flag_tile(s.flags, has_object=s.has_object)]
 
 
 def _rows(
@@ -165,7 +167,7 @@ def _rows(
     rows.append(charts.TimelineRow("in contact", _runs(s.values["contact_frame"])))
     names = list(s.values["region_names"])
     if "any" in annotated_runs:
-        rows.append(charts.TimelineRow("any, annotated", annotated_runs["any"]))
+        rows.append(charts.TimelineRow("any part, annotated", annotated_runs["any"]))
     for region in METRIC_REGIONS:
         label = region.replace("_", " ")
         if region in annotated_runs:
@@ -179,7 +181,7 @@ def _rows(
             ]
             rows.append(charts.TimelineRow(f"{label}, estimated", runs, levels=stated))
         if touching.any():
-            rows.append(charts.TimelineRow(f"{label}, meshes", _runs(touching)))
+            rows.append(charts.TimelineRow(f"{label}, from mesh distance", _runs(touching)))
     return rows
 
 
@@ -189,12 +191,12 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
         _over_frames(
             s,
             (
-                ("body to cloud", "c1", "body_visible_to_cloud"),
-                ("object to cloud", "c2", "object_visible_to_cloud"),
+                ("body to point cloud", "c1", "body_visible_to_cloud"),
+                ("object to point cloud", "c2", "object_visible_to_cloud"),
                 ("penetration", "c3", "penetration_mean"),
             ),
             "distance, mm",
-            "Distance of visible surfaces to the clouds, and depth of the body inside the object.",
+            "Distance of visible surfaces to the point clouds; depth of the body in the object.",
         ),
         _over_frames(
             s,

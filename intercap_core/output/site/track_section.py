@@ -24,9 +24,9 @@ from intercap_core.sequence_inputs import SequencePaths
 
 GOOD_OVERLAP = 0.7  # smallest IoU of a view that agrees
 VIEW_STATES = {
-    "agrees": f"candidate used, IoU {GOOD_OVERLAP:g} or more",
-    "partly": "candidate used, smaller IoU",
-    "nothing": "no candidate used",
+    "agrees": f"segmentation mask used, IoU {GOOD_OVERLAP:g} or more",
+    "partly": f"segmentation mask used, IoU below {GOOD_OVERLAP:g}",
+    "nothing": "no segmentation mask used",
 }
 TRACK_STATES = {
     "moving": "tracked",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +33,7 @@ from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 MESH_FACES = 20000  # an object with more faces is simplified
 IMAGE_WIDTH = 640  # pixels of the cameras' images, if the recorded ones are not smaller
-VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
+VERSIONS = {"joint": "joint fit", "sequential": "per-stage fits", "truth": "truth"}
 
 
 @dataclass
@@ -73,7 +73,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         upright = z_up_frame(scene)
         floor = bool(scene.attributes["ground_found"])
     bodies: dict[str, _Body] = {}
-    flags: Sequence[str] = ()
+    flags = Flags.of(0, ())
     imported = False
     if "joint" in existing:
         with artefacts.read(existing["joint"], JOINT) as joint:
@@ -82,11 +82,11 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
                 model, read_parameters(joint), joint["rotation"], joint["translation"]
             )
             rig, bias = rig.moved(joint["master_from_colour"]), joint["depth_bias"]
-            flags = Flags.read(joint).texts()
+            flags = Flags.read(joint)
             imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
     bodies["sequential"] = _sequential(paths.body_fit, existing, body_models, gender)
-    names = {**VERSIONS, "joint": "another program's"} if imported else VERSIONS
+    names = {**VERSIONS, "joint": "imported result"} if imported else VERSIONS
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
     if "metrics" in existing:
@@ -116,7 +116,11 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             "moments": moments.tolist(),
             "versions": {name: names[name] for name in bodies},
             "object": "" if mesh is None else mesh.name,
-            "flags": [[t, reason] for t, reason in enumerate(flags) if reason],
+            "flags": [
+                [t, text, bool(flags.flagged[t, 0])]  # frame, words, body is flagged
+                for t, text in enumerate(flags.texts())
+                if text
+            ],
         }
         _add_cameras(content, rig, zup)
         _add_images(content, images, rig, moments)
@@ -156,8 +160,8 @@ def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> 
     content.arrays["contact/region"] = region
 
 
-def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
-    """Add touching vertices as bits (T, ceil(V / 8)); return the flags in words."""
+def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Flags:
+    """Add touching vertices as bits (T, ceil(V / 8)); return the flags."""
     with artefacts.read(metrics, METRICS) as measured:
         if "body_contact_distance" in measured:
             touching = vertex_contact(measured["body_contact_distance"])
@@ -168,7 +172,7 @@ def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequenc
                     f"{num_vertices}; re-run stage 'metrics'"
                 )
             content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
-        return Flags.read(measured).texts()
+        return Flags.read(measured)
 
 
 def _simplified(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

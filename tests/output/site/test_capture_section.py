@@ -123,7 +123,7 @@ def test_the_timeline_states_how_late_slipped_images_are(
     drawn = capture_section.read_capture(late.paths["frames"], late.paths["scene"])["timeline"]
     assert "0–1: shows an earlier frame, 2 frames before" in drawn
     assert "2: shows an earlier frame, 1 frame before" in drawn
-    assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
+    assert "3 earlier by 1 or 2" in drawn and "1 missing" in drawn
 
 
 def test_gaps_between_sets() -> None:

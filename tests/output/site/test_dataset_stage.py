@@ -166,7 +166,7 @@ def test_pages_show_overlays_flags_and_failures(
     text = " ".join(" ".join(overview.text).split())
     captions = [str(image["alt"]) for image in overview.images]
     assert {"front", "back", "left hand, palm", "right hand, back", "one side"} <= set(captions)
-    for part in (FAILED["s03_o01"], "object lost", "Against truth", "virtual recordings"):
+    for part in (FAILED["s03_o01"], "object lost", "Against ground truth", "virtual recordings"):
         assert part in text
     assert "as published" not in text  # a figure of real recordings
     for name, shown in pages.items():

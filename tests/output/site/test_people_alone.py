@@ -135,7 +135,7 @@ def test_pages_omit_missing_parts(out: Path) -> None:
     for name, part in parts.items():
         section = part.split('id="verdict"')[1].split("</table>")[0]
         judged = ["body", "hands", *(["object"] if name == HELD else [])]
-        assert section.count("<small>odd against even, mm</small>") == len(judged)
+        assert section.count("<small>frame-to-frame noise") == len(judged)
         for of in judged:
             assert f"<td>{table.loc[name, f'verdict.{of}_odd_even_mm']:.1f}</td>" in section
     assert "p01, alone, 4 frames" in parts[ALONE] and 'id="track"' not in parts[ALONE]

@@ -94,6 +94,8 @@ def test_pages_fit_the_window_and_are_accessible(
                 page: [document.documentElement.scrollWidth, inner],
                 beyond: beyond.map((node) => node.outerHTML.slice(0, 120)),
                 wide: wide.length,
+                accuracy: [...document.querySelectorAll("#sequences th")].filter((head) =>
+                  /error|F1/.test(head.innerText)).map((head) => box(head).right),
                 smallest: letters.length ? letters.sort((a, b) => a[0] - b[0])[0] : [99, ""],
                 targets: controls.filter((node) => box(node).width && !node.closest("th"))
                   .map((node) => [tall(node), node.outerHTML.slice(0, 90)]),
@@ -102,6 +104,8 @@ def test_pages_fit_the_window_and_are_accessible(
         )
     assert found["page"][0] <= found["page"][1], found["beyond"]
     assert found["beyond"] == []
+    if name == "overview":  # errors are visible without scrolling
+        assert found["accuracy"] and max(found["accuracy"]) <= size[0]
     assert found["smallest"][0] >= _LEAST_LETTER_PX, found["smallest"]
     if phone:
         assert found["wide"] > 0 or name == "viewer"
@@ -118,7 +122,7 @@ def test_filters_and_columns(pages: dict[str, Path]) -> None:
     with visit(pages["overview"]) as visited:
         page = visited.page
         worst_first = page.evaluate(rows)
-        rank = page.locator("#sequences th", has_text="rank")
+        rank = page.locator("#sequences th", has_text="overall rank")
         assert rank.get_attribute("aria-sort") == "ascending"
         assert sorted(worst_first) == [SEQUENCE, "s01_o09"]
         form = page.locator("form.filters")

@@ -129,6 +129,11 @@ def test_the_address_restores_camera_layers_and_comparison(shown: Path) -> None:
         result.split = location.hash;
         const titles = root.querySelectorAll('[data-part="titles"] span');
         result.titles = [...titles].map((title) => title.textContent);
+        const slider = root.querySelector('[data-part="opacity"]');
+        slider.value = 0.6; slider.dispatchEvent(new Event("input"));
+        result.opacity = location.hash.includes("opacity=0.6");
+        location.hash = "#t=0.13"; await become(() => viewer.state.frame === 2);
+        result.plain = [viewer.state.other, slider.value, location.hash];
     """
     found = _browse(shown, script, link)
     result = found["result"]
@@ -139,6 +144,7 @@ def test_the_address_restores_camera_layers_and_comparison(shown: Path) -> None:
     assert legend is not None, result["legend"]
     assert result["shown"] == [True, False] and result["titles"] == ["joint fit", "truth"]
     assert float(legend[2]) == pytest.approx(mean, rel=0.1) and float(legend[1]) > mean
+    assert result["opacity"] and result["plain"] == ["", "0.3", "#t=0.13"]
     eye = _browse(shown, "result.eye = viewer.eye.position.toArray();", "#t=0.20&eye=1,2,3,0,0,1")
     assert eye["result"]["eye"] == pytest.approx([1, 2, 3])
     _browse(shown, "await become(() => viewer.cameras[1].plane.visible);", "#t=0.2&view=k2")

@@ -60,14 +60,17 @@ function vertexDistances(a, b) {
     u.fromBufferAttribute(p, i).applyMatrix4(a.matrix).distanceTo(v.fromBufferAttribute(q, i).applyMatrix4(b.matrix)));
 }
 
-/* Marks under the slider: flagged frames are red, contact is blue. */
+/* Marks under the slider: frames with an unreliable body are red, those with other flags are pale red,
+ * contact is blue. */
 function paintMarks(canvas, header, contact) {
   Object.assign(canvas, { width: header.frames, height: 2 });
   const brush = canvas.getContext("2d");
   brush.fillStyle = "#2f6fdb";
   contact.forEach((touches, t) => { if (touches) brush.fillRect(t, 1, 1, 1); });
-  brush.fillStyle = "#d2383f";
-  for (const [t] of header.flags) brush.fillRect(t, 0, 1, 1);
+  for (const [t, , ofBody] of header.flags) {
+    brush.fillStyle = ofBody ? "#d2383f" : "#eeb0b3";
+    brush.fillRect(t, 0, 1, 1);
+  }
 }
 
 /* The distance of two points that the user clicks. Points of a mesh move with it. */

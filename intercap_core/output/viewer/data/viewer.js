@@ -96,7 +96,7 @@ async function showInterCap(payload) {
   if (arrays["contact/touching"] || arrays["contact/probability"]) {
     addLayer("contact", "contact", true, (on) => (state.contact = on));
   }
-  if (!clouds.empty) addLayer("clouds", "points", false, (on) => (clouds.group.visible = on));
+  if (!clouds.empty) addLayer("clouds", "point clouds", false, (on) => (clouds.group.visible = on));
   addLayer("cameras", "cameras", true, (on) => (frusta.visible = on));
   if (arrays["images/starts"]) addLayer("images", "images", false, (on) => (state.images = on));
   const defaults = [...layers].filter(([, box]) => box.checked).map(([key]) => key).join();
@@ -105,7 +105,7 @@ async function showInterCap(payload) {
     Object.assign(state, values);
     if (state.other === state.shown) state.other = "";
     find("result").replaceChildren(...names.map((name) => new Option(header.versions[name], name)));
-    find("other").replaceChildren(new Option("nothing", ""), ...names.filter((name) => name !== state.shown).map((name) => new Option(header.versions[name], name)));
+    find("other").replaceChildren(new Option("none", ""), ...names.filter((name) => name !== state.shown).map((name) => new Option(header.versions[name], name)));
     for (const [part, key] of [["result", "shown"], ["other", "other"], ["how", "how"]]) find(part).value = state[key];
     find("how").hidden = !state.other;
     measurement.toggle(measurement.on);
@@ -125,7 +125,9 @@ async function showInterCap(payload) {
   const views = find("views");
   cameras.forEach((camera, c) => views.append(new Option(`through ${camera.name}`, c)));
   views.addEventListener("change", () => look(Number(views.value)));
-  find("opacity").addEventListener("input", (event) => { images.overlay.material.opacity = Number(event.target.value); draw(); });
+  const setOpacity = (share) => { find("opacity").value = images.overlay.material.opacity = share; draw(); };
+  const opacity = find("opacity").value; // by default
+  find("opacity").addEventListener("input", (event) => { setOpacity(event.target.value); updateAddress(); });
   find("speed").addEventListener("change", (event) => (state.speed = Number(event.target.value)));
   find("loop").addEventListener("change", (event) => (state.loop = event.target.checked));
   const scrub = find("scrub");
@@ -359,19 +361,21 @@ async function showInterCap(payload) {
       layers: shown === defaults ? null : shown,
       result: state.shown === names[0] ? null : state.shown,
       other: state.other, how: state.other && state.how,
+      opacity: find("opacity").value === opacity ? null : find("opacity").value,
     };
     history.replaceState(null, "", `#${Object.entries(link).filter(([, value]) => value !== null && value !== "").map((pair) => pair.join("=")).join("&")}`);
   };
-  /* Show what the address names, if it names a time. */
+  /* Show what the address names, if it names a time; the rest is as by default. */
   const followAddress = () => {
     const link = new URLSearchParams(location.hash.slice(1)), seconds = Number(link.get("t"));
     if (!link.has("t") || !Number.isFinite(seconds)) return;
     pause();
     state.frame = Math.round(seconds * header.fps);
-    const on = link.get("layers")?.split(",");
-    for (const [key, box] of layers) if (on && box.checked !== on.includes(key)) box.click();
+    const on = (link.get("layers") ?? defaults).split(",");
+    for (const [key, box] of layers) if (box.checked !== on.includes(key)) box.click();
     const [result, other] = ["result", "other"].map((key) => (names.includes(link.get(key)) ? link.get(key) : null));
-    if (result || other) compare({ shown: result ?? names[0], other: other ?? "", how: link.get("how") === "distance" ? "distance" : "split" });
+    compare({ shown: result ?? names[0], other: other ?? "", how: link.get("how") === "distance" ? "distance" : "split" });
+    setOpacity(link.get("opacity") ?? opacity);
     const view = cameras.findIndex(({ name }) => name === link.get("view")), at = link.get("eye")?.split(",").map(Number) ?? [];
     if (view !== through) look(view);
     if (view < 0 && at.length === 6 && at.every(Number.isFinite)) {
