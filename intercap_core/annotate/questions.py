@@ -149,8 +149,8 @@ def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str
             "sides", "", doubt.first, doubt.last, doubt.frame,
             "Are L and R in the views the subject's own left and right?",
             2.0 * (doubt.last - doubt.first + 1),
-            (("yes", "Yes, in every view"), ("view", f"Exchanged in {doubt.camera}"),
-             ("all", "Exchanged in every view"), ("mark", "I mark where"),
+            (("yes", "Yes, in every view"), ("view", f"Swapped in {doubt.camera}"),
+             ("all", "Swapped in every view"), ("mark", "I mark where"),
              ("unsure", "I cannot tell")),
             camera=doubt.camera, why=doubt.message,
         )

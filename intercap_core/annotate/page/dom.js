@@ -19,7 +19,7 @@ export function make(tag, properties = {}, ...children) {
 export const button = (text, click, properties = {}) =>
   make("button", { type: "button", onclick: click, ...properties }, text);
 
-export const readable = (name) => name.replaceAll("_", " ");
+export const readable = (name) => (name === "any" ? "any part" : name.replaceAll("_", " "));
 
 /* Replace the children of a box. A control that had the keyboard focus passes it to the nearest new control
  * with the same label, or else to the first one. */

@@ -3,7 +3,7 @@ import { ask, find, make } from "./dom.js";
 
 const KEYS = [
   ["← →", "previous and next frame; with Shift ten frames"], ["Home End", "first and last frame"], ["Space", "play"],
-  ["N P", "next and previous flag or doubt"], ["F", "zoom to the object and follow it; again: show whole images"], ["1 2 3 4 5", "layers: body, object, contact, marks, left and right (also L)"],
+  ["N P", "next and previous issue"], ["F", "zoom to the object and follow it; again: show whole images"], ["1 2 3 4 5", "layers: body, object, contact, marks, left and right (also L)"],
   ["B", "the result before the last run"], ["O", "place the object"], ["S", "fit the object to the images"],
   ["C", "confirm contact"], ["[ ]", "contact starts or ends at this frame"], ["K", "split contact"], ["Delete", "delete contact"],
   ["E", "exchange left and right in the view under the pointer, from this frame; again: up to this frame; with Shift in all views"],

@@ -197,7 +197,7 @@ class App {
   jump(by) {
     const frames = [...new Set(this.info.places.map(({ frame }) => frame))].sort((a, b) => a - b);
     const next = by > 0 ? frames.find((t) => t > this.frame) : frames.findLast((t) => t < this.frame);
-    if (next === undefined) this.say(`no flag or doubt ${by > 0 ? "after" : "before"} this frame`);
+    if (next === undefined) this.say(`no issue ${by > 0 ? "after" : "before"} this frame`);
     else this.show(next);
   }
 
@@ -311,7 +311,7 @@ class App {
   }
 
   #tabs() {
-    const panels = { doubts: "Doubts", questions: "Questions", object: "Object", marks: "Marks", sides: "Sides", run: "Run" };
+    const panels = { doubts: "Issues", questions: "Questions", object: "Object", marks: "Subject, floor, frames", sides: "Left/right", run: "Run" };
     if (!this.info.object) delete panels.object;
     find("tabs").replaceChildren(...Object.entries(panels).map(([name, text]) => {
       const tab = button(text, () => this.tab(name), { id: `tab-${name}`, role: "tab", data: { tab: name } });
@@ -350,7 +350,7 @@ class App {
 function doubts(app) {
   const { info } = app, verdict = info.verdict ?? [];
   const warnings = [info.track?.doubts, info.subject?.doubts].filter(Boolean);
-  const none = info.verdict ? "No frame is flagged or doubtful." : "Flags and errors are not computed yet: run the stages.";
+  const none = info.verdict ? "There are no issues." : "Flags and errors are not computed yet: run the stages.";
   return make("div", {},
     verdict.length ? make("p", {}, "Estimated errors (no ground truth): ", verdict.map(({ part, mm, silent }) => `${part} ${mm === null ? `– (${silent})` : `${mm} mm`}`).join(", "), ".") : null,
     warnings.map((text) => make("p", { class: "fault" }, text)),
@@ -369,7 +369,7 @@ function showInfo(info) {
 
 async function start() {
   const stop = (text) => { find("stopped").hidden = false; find("stopped").textContent = text; };
-  if (!readToken()) { stop("The token is missing: open the address that `intercap annotate` printed."); return; }
+  if (!readToken()) { stop("Open the full address that `intercap annotate` printed."); return; }
   const name = /^\/sequence\/([^/]+)$/.exec(location.pathname)?.[1];
   try {
     if (!name) { await showList(); return; }

@@ -254,7 +254,7 @@ export class PoseEditor {
     }
     const numbers = [
       ...["x", "y", "z"].map((axis, i) => [`${axis}, m`, () => this.pose[i][3], (v) => { this.pose = this.pose.map((row, k) => (k === i ? [row[0], row[1], row[2], v] : row)); }, 0.005]),
-      ...["x", "y", "z"].map((axis, i) => [`rotation ${axis}, rad`, () => rotationVector(this.pose)[i], (v) => {
+      ...["x", "y", "z"].map((axis, i) => [`rotation vector ${axis}, rad`, () => rotationVector(this.pose)[i], (v) => {
         const next = [...rotationVector(this.pose)]; next[i] = v;
         this.pose = rigid(next, this.pose.map((row) => row[3]));
       }, 0.02]),
@@ -268,7 +268,7 @@ export class PoseEditor {
       return box;
     }
     box.replaceChildren(
-      make("p", {}, `Object in frame ${app.frame}; coordinates of the master camera: x right, y down, z forward.`),
+      make("p", {}, `Object in frame ${app.frame}; coordinates of reference camera ${app.info.master}: x right, y down, z forward.`),
       make("div", { class: "numbers" }, numbers.map(([name, value, set, step]) => make("label", {}, name,
         make("input", { type: "number", step: String(step), value: value().toFixed(4), oninput: (event) => {
           const number = event.target.valueAsNumber;

@@ -230,8 +230,8 @@ export class Saving {
     if (this.stale) parts.push(this.stale.length ? make("div", {}, make("p", {}, "A run would compute:"),
       make("ol", {}, this.stale.map(({ stage, reasons }) => make("li", {}, make("b", {}, readable(stage)), make("span", { class: "dim" }, ` ${reasons.join("; ")}`))))) : make("p", {}, "All results are up to date."));
     if (run.cluster) parts.push(make("p", {}, "Jobs run on a cluster. Run there:"), command(run.command));
-    else parts.push(button("Run stale stages", () => this.start(), { class: "main" }));
-    parts.push(button("What would run?", () => this.plan()));
+    else parts.push(button("Recompute outdated stages", () => this.start(), { class: "main" }));
+    parts.push(button("Show outdated stages", () => this.plan()));
     if (!run.cluster && run.command) parts.push(make("details", {}, make("summary", {}, "Command for a terminal"), command(run.command)));
     if (this.comparison?.edits?.length) parts.push(...this.#editsPart());
     if (this.comparison?.exists) parts.push(...this.#comparisonPart());
@@ -247,7 +247,7 @@ export class Saving {
     return [
       make("p", {}, ending ? `Ending for ${run.ending_s.toFixed(0)} s; unfinished results are removed, which takes at most ${run.ends_within_s.toFixed(0)} s.` : state),
       make("ol", { class: "stages" }, stages),
-      ending && run.ending_s <= run.ends_within_s ? null : button(ending ? "Kill" : "Stop", () => this.stop())];
+      ending && run.ending_s <= run.ends_within_s ? null : button(ending ? "Force stop" : "Stop", () => this.stop())];
   }
 
   /* Each entry of the annotation beside the result, those that differ first. */

@@ -12,21 +12,21 @@ export function sidesPanel(app) {
     const range = sides.open.get(camera ?? "");
     const cameras = info.cameras.map((_, c) => c).filter((c) => !camera || info.cameras[c].name === camera);
     const on = range ? range.on : !cameras.every((c) => sides.stated(c, frame));
-    const text = `${on ? "Exchanged" : "As detected"} ${range ? `${Math.min(range.from, frame)} to ${Math.max(range.from, frame)}` : `from ${frame}…`}`;
+    const text = `${on ? "Swapped" : "Not swapped"} ${range ? `${Math.min(range.from, frame)} to ${Math.max(range.from, frame)}` : `from ${frame}…`}`;
     return button(text, () => sides.press(camera), { class: range ? "main" : "", data: { sides: camera ?? "all" }, title: camera ? "E, with the pointer in this view" : "Shift+E" });
   };
   const state = (c) => (sides.differs(c, frame) ? make("span", { class: "fault" }, "differs from the body")
-    : make("span", { class: "dim" }, sides.stated(c, frame) ? "exchanged by annotation" : sides.data ? "agrees with the body" : ""));
+    : make("span", { class: "dim" }, sides.stated(c, frame) ? "swapped by annotation" : sides.data ? "agrees with the body" : ""));
   const differing = sides.data ? info.cameras.flatMap(({ name }, c) =>
     intervals(Array.from({ length: info.frames }, (_, t) => sides.differs(c, t))).map(([a, b]) => ({ camera: name, a, b })))
     .sort((p, q) => q.b - q.a - (p.b - p.a)) : [];
   return make("div", { class: "sides" },
-    make("p", {}, legend(), " Thick lines: body of the result. Thin lines with letters: detected limbs, exchanged where the annotation states it. If letters are on the wrong side of the person, state the first and last frame."),
+    make("p", {}, legend(), " Thick lines: body of the result. Thin lines with letters: detected limbs, swapped as annotated. If letters are on the wrong side of the person, annotate the first and last frame."),
     sides.fault ? make("p", { class: "fault" }, sides.fault) : sides.data ? null : make("p", { class: "dim" }, app.layers.sides ? "Loading…" : "Press L to show left and right."),
     make("table", {}, info.cameras.map((camera, c) => make("tr", {}, make("td", {}, camera.name), make("td", {}, state(c)), make("td", {}, rangeButton(camera.name)))),
       make("tr", {}, make("td", {}, "All"), make("td", {}), make("td", {}, rangeButton(null)))),
     sides.open.size ? button("Cancel unfinished ranges", () => { sides.cancel(); app.timeline.draw(); app.panels(); }, { title: "Esc" }) : null,
-    make("h2", {}, entries.length ? "Stated exchanges" : "No exchanges are stated"),
+    make("h2", {}, entries.length ? "Annotated left/right swaps" : "No left/right swaps annotated"),
     make("ul", {}, entries.map((entry) => {
       const [start, end] = sides.framesOf(entry);
       return make("li", {}, `${entry.camera ?? "All views"}, ${framesText([start, end])} `,

@@ -54,7 +54,7 @@ export class Timeline {
     const { app } = this, { info } = app;
     find("frame").max = Math.max(0, info.frames - 1);
     const focused = document.activeElement?.dataset?.interval;
-    const marks = this.#lane("doubts", "Flags and doubts");
+    const marks = this.#lane("doubts", "Issues");
     for (const place of info.places) {
       marks.lane.append(this.#mark(place.first, place.last + 1, `mark ${place.kind}`, place.message,
         () => app.show(place.frame)));
@@ -116,8 +116,8 @@ export class Timeline {
     if (differs) lane.append(this.#heat((t) => (differs[t] ? 1 : 0)));
     for (const entry of entries) {
       const [start, end] = sides.framesOf(entry);
-      const title = `left and right exchanged in ${camera ?? "all views"}, frames ${start} to ${end - 1}`;
-      const bar = this.#bar(title, `sides:${camera ?? ""}:${start}:${end}`, "stated", "exchanged");
+      const title = `left and right swapped in ${camera ?? "all views"}, frames ${start} to ${end - 1}`;
+      const bar = this.#bar(title, `sides:${camera ?? ""}:${start}:${end}`, "stated", "swapped");
       this.#place(bar, start, end);
       bar.onfocus = () => { app.contact.selected = null; sides.selected = entry; };
       bar.onblur = () => { if (sides.selected === entry) sides.selected = null; };
@@ -163,7 +163,7 @@ export class Timeline {
   #interval(interval) {
     const { app, contact } = this;
     const confirmed = contact.isConfirmed(interval), percent = Math.round(100 * contact.mean(interval));
-    const title = `${readable(interval.part)}, frames ${interval.start} to ${interval.end - 1}, ${confirmed ? (interval.uncertain ? "stated, ends uncertain" : "stated") : `estimated, probability ${percent} %`}`;
+    const title = `${readable(interval.part)}, frames ${interval.start} to ${interval.end - 1}, ${confirmed ? (interval.uncertain ? "annotated, ends uncertain" : "annotated") : `estimated, probability ${percent} %`}`;
     const bar = this.#bar(title, id(interval), confirmed ? "stated" : "estimated", confirmed ? "" : `${percent} %`);
     bar.setAttribute("aria-pressed", String(contact.selected !== null && id(contact.selected) === id(interval)));
     this.#place(bar, interval.start, interval.end);
@@ -224,8 +224,8 @@ export class Timeline {
       contact.add(choose.value, app.frame, Math.min(app.info.frames, app.frame + Math.ceil(app.info.fps / 2)));
     } }, new Option("add contact here…", ""), ...["any", ...contact.regions].map((part) => new Option(readable(part), part)));
     choose.setAttribute("aria-label", "Add contact at this frame");
-    const state = contact.stated ? !contact.stated.length ? "the annotation states that nothing touches"
-      : `${contact.stated.length} ${contact.stated.length === 1 ? "interval" : "intervals"} stated, ${contact.stated.filter((interval) => !contact.isConfirmed(interval)).length} of them unconfirmed`
+    const state = contact.stated ? !contact.stated.length ? "annotated: no contact in the whole sequence"
+      : `${contact.stated.length} annotated, ${contact.stated.filter((interval) => !contact.isConfirmed(interval)).length} not yet confirmed`
       : contact.probability ? "estimated contact: the first edit copies it into the annotation" : "no contact has been estimated yet";
     refill(find("contact-bar"), contact.stated?.length === 0 ? make("b", {}, state) : make("span", { class: "dim" }, state), choose, ...(selected ? [
       make("b", {}, `${readable(selected.part)} ${selected.start}–${selected.end - 1}`),
@@ -238,8 +238,8 @@ export class Timeline {
       button("Split here", () => contact.split(selected, app.frame), { title: "K" }),
       button("Delete", () => contact.remove(selected), { title: "Delete" }),
     ] : []), ...(!contact.stated && contact.probability ? [button("Copy the estimate", () => contact.copyEstimate(), { title: "Copy all estimated intervals into the annotation" })] : []),
-    ...(contact.stated?.length === 0 ? [] : [button("Nothing touches", () => contact.stateNone(), { title: "No part touches the object in the whole sequence" })]),
-    ...(contact.stated ? [button("Use the estimate", () => contact.unstate(), { title: "Remove contact from the annotation" })] : []));
+    ...(contact.stated?.length === 0 ? [] : [button("No contact at all", () => contact.stateNone(), { title: "No part touches the object in the whole sequence" })]),
+    ...(contact.stated ? [button("Discard, use the estimate", () => contact.unstate(), { title: "Remove contact from the annotation" })] : []));
   }
 
   cursor() {

@@ -11,7 +11,7 @@ from tests.annotate.served import annotation, served
 from tests.helpers.browser import needs_chromium
 
 pytestmark = needs_chromium
-NONE = "the annotation states that nothing touches"
+NONE = "annotated: no contact in the whole sequence"
 START = {"uncertain": "start"}  # an estimated end that was not edited
 
 
@@ -54,7 +54,7 @@ def test_nothing_touches_is_stated_and_removed(settings: Path) -> None:
         hand.page.locator(HAND).focus()
         hand.press("Delete")  # the last interval
         assert hand.draft("contact") == [] and NONE in hand.text("#contact-bar")
-        hand.click("Use the estimate")
+        hand.click("Discard, use the estimate")
         assert hand.draft("contact") is None and hand.page.locator(HAND).count() == 1
         hand.press("Control+z")
         assert hand.draft("contact") == []
@@ -65,11 +65,11 @@ def test_nothing_touches_is_stated_and_removed(settings: Path) -> None:
         assert path.read_text() == "contact: []\n"
         hand.reload()
         assert hand.draft("contact") == [] and NONE in hand.text("#contact-bar")
-        hand.click("Use the estimate")
+        hand.click("Discard, use the estimate")
         hand.open_save()
         hand.answer("save")
         hand.wait("document.getElementById('status').textContent === 'no annotation yet'")
-        hand.click("Nothing touches")
+        hand.click("No contact at all")
         assert hand.draft("contact") == [] and path.read_text().strip() == ""
 
 

@@ -70,7 +70,7 @@ def test_a_stopped_run_is_shown_as_ending(settings: Path, monkeypatch: pytest.Mo
     with served(settings) as server, open_page(server) as hand:
         monkeypatch.setattr(rerun.subprocess, "Popen", start)
         hand.page.locator("#tab-run").click()
-        hand.click("Run stale stages")
+        hand.click("Recompute outdated stages")
         hand.wait("window.annotate.saving.run.state === 'running'")
         assert "remaining time unknown" in hand.text("#panels")
         hand.page.wait_for_timeout(700)  # until the process handles signals
@@ -98,7 +98,7 @@ def test_before_the_first_run_the_page_names_the_command(settings: Path) -> None
     with served(settings) as server, open_page(server) as hand:
         assert "intercap run" in hand.text("#banners")
         hand.page.locator("#tab-run").click()
-        assert hand.page.get_by_text("Run stale stages").is_visible()
+        assert hand.page.get_by_text("Recompute outdated stages").is_visible()
         hand.press("x")
         hand.app("saving.poll()")
         assert hand.page.locator('[data-banner="result"]').count() == 0
