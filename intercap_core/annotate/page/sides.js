@@ -92,7 +92,7 @@ export class Sides {
       if (camera && c !== this.#index(camera)) return;
       row.fill(on ? 1 : 0, this.#set(c, a), this.#set(c, b) + 1);
     });
-    this.#store(rows, on ? "left and right exchanged" : "left and right as detected");
+    this.#store(rows, on ? "left and right swapped" : "left and right not swapped");
   }
 
   /* Move an entry to other frames; remove it if `end` <= `start`. */
@@ -125,12 +125,12 @@ export class Sides {
     if (range) {
       this.open.delete(key);
       this.change(camera, range.from, app.frame, range.on);
-      app.say(`${camera ?? "all views"}: left and right ${range.on ? "exchanged" : "as detected"} in frames ${Math.min(range.from, app.frame)} to ${Math.max(range.from, app.frame)}`);
+      app.say(`${camera ?? "all views"}: left and right ${range.on ? "swapped" : "not swapped"} in frames ${Math.min(range.from, app.frame)} to ${Math.max(range.from, app.frame)}`);
     } else {
       const cameras = camera ? [this.#index(camera)] : app.info.cameras.map((_, c) => c);
       const on = !cameras.every((c) => this.stated(c, app.frame));
       this.open.set(key, { from: app.frame, on });
-      app.say(`${camera ?? "all views"}: ${on ? "exchanged" : "not exchanged"} from frame ${app.frame}; go to the last frame and press again`);
+      app.say(`${camera ?? "all views"}: ${on ? "swapped" : "not swapped"} from frame ${app.frame}; go to the last frame and press again`);
     }
     app.timeline.draw();
     app.panels();
