@@ -43,7 +43,9 @@ def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
         hand.page.locator("#tab-run").click()
         hand.app("saving.compare()")
         [edit] = hand.page.locator(".edits .differs", has_text="right hand").all_inner_texts()
-        assert "frames 2 to 3" in edit and "2 to 7" in edit and "recompute the outdated stages" in edit
+        assert (
+            "frames 2 to 3" in edit and "2 to 7" in edit and "recompute the outdated stages" in edit
+        )
     text = annotation(settings).read_text()
     assert text.startswith("# kept\ndrop_frames: [9]\n") and "start: 2, end: 4" in text
 
