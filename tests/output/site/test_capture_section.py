@@ -121,8 +121,8 @@ def test_the_timeline_states_how_late_slipped_images_are(
     with late.edit("frames") as file:
         file["colour_index"][3, 1] = file["depth_index"][3, 1] = -1
     drawn = capture_section.read_capture(late.paths["frames"], late.paths["scene"])["timeline"]
-    assert "0–1: shows an earlier frame, 2 frames before" in drawn
-    assert "2: shows an earlier frame, 1 frame before" in drawn
+    assert "0–1: shows an earlier frame (images lost), 2 frames before" in drawn
+    assert "2: shows an earlier frame (images lost), 1 frame before" in drawn
     assert "3 earlier by 1 or 2" in drawn and "1 missing" in drawn
 
 

@@ -104,8 +104,9 @@ def test_pages_fit_the_window_and_are_accessible(
         )
     assert found["page"][0] <= found["page"][1], found["beyond"]
     assert found["beyond"] == []
-    if name == "overview":  # errors are visible without scrolling
-        assert found["accuracy"] and max(found["accuracy"]) <= size[0]
+    if name == "overview":  # visible without scrolling; on a phone, errors against ground truth
+        shown = found["accuracy"][:4] if phone else found["accuracy"]
+        assert len(found["accuracy"]) > 4 and max(shown) <= size[0]
     assert found["smallest"][0] >= _LEAST_LETTER_PX, found["smallest"]
     if phone:
         assert found["wide"] > 0 or name == "viewer"
