@@ -130,8 +130,11 @@ def test_an_answered_question_is_not_asked_again(settings: Path) -> None:
         _ask(hand, seat)
         hand.press("1")
         hand.wait(f"!window.annotate.questions.list.some((q) => {seat})")
-        assert {"part": "seat", "start": 4, "end": 8} in hand.draft("contact")
-        hand.press("Control+z")  # the question of an undone edit is asked again
+        stated = {"part": "seat", "start": 4, "end": 8, "uncertain": "both"}
+        assert stated in hand.draft("contact")
+        hand.app("contact.add('seat', 6, 9)")  # the end is exact, the start stays uncertain
+        assert stated | {"end": 9, "uncertain": "start"} in hand.draft("contact")
+        hand.press("Control+z", "Control+z")  # the question of an undone edit is asked again
         _ask(hand, seat)
         hand.press("1")
         hand.save()

@@ -115,7 +115,7 @@ def test_before_the_first_run_the_page_names_the_command(settings: Path) -> None
 def test_a_page_without_the_token_shows_nothing(settings: Path) -> None:
     with served(settings) as server, visit(server.address, size=SIZE) as page:
         page.wait("!document.getElementById('stopped').hidden")
-        assert "token" in page.page.locator("#stopped").inner_text()
+        assert "full address" in page.page.locator("#stopped").inner_text()
 
 
 @pytest.mark.parametrize("dark", [False, True])
