@@ -142,7 +142,7 @@ def closeups(
         typer.Option(help="Folder for the pictures; default: closeups/ in the results."),
     ] = None,
 ) -> None:
-    """Render hands in contact: the joint fit, the sequential fits and, if known, the truth.
+    """Render hands in contact: the joint fit, the per-stage fits and, if known, the truth.
 
     Writes one picture per interval of hand contact, at its middle frame and from two sides. Skin
     within 4.5 mm of the object is red. Needs no display and no GPU.

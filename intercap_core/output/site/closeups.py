@@ -1,4 +1,4 @@
-"""Close-ups of hand contacts: the joint fit next to the sequential fits and, if known, truth.
+"""Close-ups of hand contacts: the joint fit next to the per-stage fits and, if known, truth.
 
 A hold is a run of frames in which the joint fit's probability of contact of a hand exceeds 0.5. It
 is drawn at its middle frame from two viewpoints that show most of hand and object. A column of the
@@ -153,7 +153,7 @@ def read_handling(paths: SequencePaths, models: SequenceModels, *, truth: Path |
         )
         for name, body, pose in (
             (
-                "sequential",
+                "per-stage",
                 read_body(paths.body_fit, "body_fit", body_models, gender),
                 read_object(paths.object_track, "object_track"),
             ),

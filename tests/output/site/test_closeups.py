@@ -73,8 +73,8 @@ def test_holds_are_runs_over_a_half_longest_first() -> None:
 def test_columns_are_sequential_joint_and_truth(
     capture: fitted.Capture, handling: Handling
 ) -> None:
-    assert [column.name for column in handling.columns] == ["sequential", "joint", "truth"]
-    assert [column.name for column in read(capture, None).columns] == ["sequential", "joint"]
+    assert [column.name for column in handling.columns] == ["per-stage", "joint", "truth"]
+    assert [column.name for column in read(capture, None).columns] == ["per-stage", "joint"]
     sequential, joint, truth = (column.at(2) for column in handling.columns)
     down = [0, fitted.OBJECT_OFFSET_M, 0]
     np.testing.assert_allclose(sequential.vertices - truth.vertices, [down] * len(truth.vertices))
