@@ -13,7 +13,7 @@ from pydantic import (
     model_validator,
 )
 
-from intercap_core.config_types import CameraName, FrameNumber, Model, Position, Seconds, Vector3
+from intercap_core.config_types import CameraName, FrameNumber, Model, Position, Radians, Seconds
 from intercap_core.schemas import CONTACT_REGIONS
 
 MIN_FLOOR_SPREAD_M = 0.02  # points closer to one line do not determine a plane
@@ -63,7 +63,7 @@ class ObjectPose(Model):
 
     frame: FrameNumber = 0
     """Frame set of the pose."""
-    rotation_vector: Vector3
+    rotation_vector: tuple[Radians, Radians, Radians]
     """Rotation of master_from_object, axis times angle, radians."""
     translation: Position
     """Translation of master_from_object (position of the mesh's origin), metres."""

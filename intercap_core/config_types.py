@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -55,6 +56,8 @@ RESERVED_SEQUENCES = ("export", "recordings", "site", "tables")  # other folders
 RESERVED_OBJECTS = ("person",)  # the class of people in detections and in COCO exports
 
 Vector3 = tuple[float, float, float]
+
+Radians = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
 
 CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
 

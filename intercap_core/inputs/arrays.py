@@ -121,7 +121,9 @@ def read_pickle(path: Path) -> Any:
     try:
         return _Unpickler(io.BytesIO(content), encoding="latin1").load()
     except PICKLE_ERRORS as error:
-        reason = printable(str(error))[:200] or type(error).__name__
+        reason = printable(str(error))[:200]
+        if not reason or " at 0x" in reason:  # the address of an object of Python's
+            reason = type(error).__name__
         raise UnreadableFile(
             Path(path),
             f"not a pickle of numpy arrays and plain values ({reason})",

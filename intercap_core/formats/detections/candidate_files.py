@@ -215,9 +215,8 @@ def _notes_on_place(
             f"{beyond} of {count} masks{where} reach beyond the image of {size[0]}x{size[1]} "
             f"pixels and are cut{hint_on_size(beyond, count)}"
         )
-    ends = [(instance.box[i] + instance.box[i + 2]) / size[i] for instance in instances
-            for i in (0, 1)]  # fmt: skip
-    return notes + notes_on_extent(f"masks{where}", max(ends, default=0.0), size)
+    extent = max((file.extent for file in files), default=0.0)
+    return notes + notes_on_extent(f"masks{where}", extent, size)
 
 
 def _add_masks_of_camera(

@@ -18,6 +18,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
+
 from intercap_core.formats.detections.class_names import check_label, parse_class_names
 from intercap_core.formats.detections.instance import (
     Instance,
@@ -70,6 +72,8 @@ class DetectionFile(Generic[Result]):
     """Number of masks whose corners are shares of the image's width and height."""
     beyond: int = 0
     """Number of masks that reach beyond the image."""
+    extent: float = 0.0
+    """Largest coordinate of masks that state no image size, as a share of width or height."""
 
     @property
     def is_useless(self) -> bool:
@@ -179,6 +183,9 @@ def parse_candidates(
             result.scaled += factors not in ((1.0, 1.0), form.size)
             result.shares += factors == form.size
             result.beyond += reaches_beyond(segmentation, factors, form.size)
+            if not (isinstance(segmentation, dict) and "counts" in segmentation):
+                ends = np.add(instance.box[:2], instance.box[2:]) / form.size
+                result.extent = max(result.extent, float(ends.max()))
         result.entries += 1
     return result
 
