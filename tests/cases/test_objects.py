@@ -40,8 +40,8 @@ def test_relative_indices_give_the_same_solid(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (" ", "\t"), ("\nv ", "\nv\t"), ("\nv", "\n  v"), ("\nf", "\n\tf"), ("\nf", " # note\nf"),
-        ("\nv", "#note\nv"), ("\nv ", "\nv \\\n"),
+        (" ", "\t"), ("\nv ", "\nv\t"), ("\nv", "\n  v"), ("\n#", "\ufeff#"), ("\nf", "\n\tf"),
+        ("\nf", " # note\nf"), ("\nv", "#note\nv"), ("\nv ", "\nv \\\n"),
     ],
 )  # fmt: skip
 def test_spaces_and_comments_of_obj_are_read(tmp_path, before, after):
@@ -66,6 +66,20 @@ def test_relative_indices_before_the_first_vertex_are_refused(tmp_path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 -2 -1\n")
     with pytest.raises(UserError, match="a face names vertex -4 of 3 above it"):
         load(path)
+
+
+@pytest.mark.parametrize("face", ["0 1 2", "1 2/1/1 0/1/1", "1 2 0"])
+def test_indices_from_0_are_refused(tmp_path, face):
+    path = tmp_path / "box.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf {face}\n")
+    with pytest.raises(UserError, match="a face names vertex 0, vertices of OBJ are counted from"):
+        load(path)
+
+
+def test_a_mask_of_contact_vertices_is_refused(tmp_path):
+    (tmp_path / "contact.json").write_text("[0, 1, 1, 0, 0, 0, 0, 1]")
+    with pytest.raises(UserError, match="is a mask of all 8 vertices; write the ids"):
+        load(box(tmp_path, "obj"), contact_vertices=tmp_path / "contact.json")
 
 
 def test_contact_vertices_have_the_numbers_of_an_obj_with_seams(tmp_path):

@@ -61,6 +61,10 @@ def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.nd
     )
     if ids.ndim != 1 or len(ids) == 0 or not whole:
         raise UserError(f"{path}: not a list of vertex ids; write it as a JSON list [0, 1, ...]")
+    if len(ids) == len(vertices) and ids.max() <= 1:
+        raise UserError(
+            f"{path}: is a mask of all {len(vertices)} vertices; write the ids of the marked ones"
+        )
     if ids.min() < 0 or ids.max() >= len(vertices):
         outside = quoted(int(ids.max() if ids.max() >= len(vertices) else ids.min()))
         raise UserError(

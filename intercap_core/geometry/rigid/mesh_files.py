@@ -196,7 +196,10 @@ def _plain_obj(content: bytes) -> bytes:
     negative indices from the end of the file. They count back from the vertices above the face.
     Raises ValueError for an index before the first vertex.
     """
+    content = content.removeprefix(b"\xef\xbb\xbf")  # byte order mark
     content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    if re.search(rb"^[ \t]*f[ \t](?:[^\n#]*[ \t])?0(?=[/\s]|$)", content, re.MULTILINE):
+        raise ValueError("a face names vertex 0, vertices of OBJ are counted from 1")
     unread = rb"^f\s[^\n#]*-\d|^[ \t]+[vf]|^[vf]\w?(?=\s)[^\n]*[\t#]"
     if not re.search(unread, content, re.MULTILINE):
         return content
