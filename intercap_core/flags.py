@@ -7,6 +7,7 @@ trusted: a frame whose object is lost can have a reliable body.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -81,7 +82,7 @@ class Flags:
     def texts(self) -> list[str]:
         """(T,) parts and reasons to print, such as "object and contact (object lost)"."""
         return [
-            "; ".join(f"{_join(parts)} ({reason})" for parts, reason in _clauses(text))
+            "; ".join(f"{_join(parts)} ({reason})" for parts, reason in _clauses(text)) or text
             for text in self.reasons
         ]
 
@@ -96,11 +97,16 @@ class Flags:
         return f"flagged: {words or 'none'} of {len(self.flagged)} frames"
 
 
+_PART = "|".join(PARTS)
+_HEAD = re.compile(rf"(?:^|; )((?:{_PART})(?:, (?:{_PART}))*): ")
+
+
 def _clauses(text: str) -> Iterator[tuple[list[str], str]]:
     """Yield the parts and the reason of each clause of a frame's text."""
-    for clause in filter(None, text.split("; ")):
-        parts, _, reason = clause.rpartition(": ")
-        yield parts.split(", "), reason
+    heads = list(_HEAD.finditer(text))
+    ends = [head.start() for head in heads[1:]] + [len(text)]
+    for head, end in zip(heads, ends, strict=False):
+        yield head[1].split(", "), text[head.end() : end]
 
 
 def _join(words: Sequence[str]) -> str:

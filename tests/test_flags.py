@@ -20,6 +20,14 @@ def test_a_cause_flags_its_parts_and_the_others_stay_trusted():
     assert flags.reasons_of("hands") == ["", "", "no images"]
 
 
+def test_reasons_may_contain_separators():
+    always = np.array([True])
+    flags = Flags.of(1, [(always, "k1: cut; repaired", ["body"]), (always, "lost", OF_OBJECT)])
+    assert flags.reasons == ["body: k1: cut; repaired; object, contact: lost"]
+    assert flags.texts() == ["body (k1: cut; repaired); object and contact (lost)"]
+    assert flags.reasons_of("body") == ["k1: cut; repaired"]
+
+
 def test_a_person_alone_has_no_flags_of_object_and_contact():
     flags = Flags.of(1, [(np.array([True]), "not seen", OF_BODY)], has_object=False)
     assert flags.flagged.tolist() == [[True, True, False, False]]

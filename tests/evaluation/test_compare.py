@@ -46,7 +46,7 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
         turn = Rotation.from_rotvec([0, 0, np.radians(3.0)]).as_matrix()
         file["rotation"][2] = turn @ file["rotation"][2]
         file["contact_probability"][3, HAND] = 0.0
-        file["flagged"][3, 0], file["flag_reason"][3] = True, b"?"
+        file["flagged"][3, 0], file["flag_reason"][3] = True, b"body: ?"
     with h5py.File(versions[0] / "b" / "joint.h5", "r+") as file:
         file["contact_probability"][3, HAND] = 0.9
     found = compare(*versions)
@@ -59,7 +59,7 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
     assert frames.loc[1, "hands_mm"] == pytest.approx(5, rel=1e-4)
     assert frames.loc[2, "object_deg"] == pytest.approx(3)
     assert frames.loc[3, ["touches", "touches_no_more"]].tolist() == ["", "right_hand"]
-    assert frames.loc[3, ["flag_before", "flag_after"]].tolist() == ["", "body: ?"]
+    assert frames.loc[3, ["flag_before", "flag_after"]].tolist() == ["", "body (?)"]
     back = compare(*reversed(versions)).frames.set_index("frame")
     assert back.loc[3, "touches"] == "right_hand"
 

@@ -94,9 +94,9 @@ def test_report_names_the_other_program(imported, tmp_path):
     out = write_site({NAME: imported}, tmp_path / "site", settings=small)
     overview = (out / "site" / "index.html").read_text()
     page = (out / "site" / "sequences" / NAME / "index.html").read_text()
-    assert "1 with results of another program" in overview
+    assert "1 with imported results" in overview
     assert "made by another program: res.pkl" in page and "energy of each term" not in page
-    assert "1 sequences have results of another program" in (out / "card.md").read_text()
+    assert "1 sequences have imported results" in (out / "card.md").read_text()
 
 
 def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):
