@@ -21,15 +21,11 @@ from tests.helpers.bodies import open_body
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 
-# Folders whose tests stay on one worker, by a name for them: they share a long run, or compile the
-# same kernels, which two workers would compile twice.
-TOGETHER = {"body_fit": "kernels", "joint": "kernels", "workflow": "workflow", "slurm": "slurm"}
-# Folders in the order in which they start; the others follow. While one worker compiles kernels,
-# the other runs folders that need none. Then come long files, so that all workers end together.
-FIRST = (
-    *("body_fit", "joint", "formats", "commands", "tables", "inputs"),
-    *("workflow", "slurm", "stages", "object_track", "studio"),
-)
+# Folders whose tests share a long run: all their tests stay on one worker.
+TOGETHER = ("workflow", "slurm")
+# Folders in the order in which they start; the others follow. The first ones compile most kernels,
+# which the processes of the next would compile again.
+FIRST = ("body_fit", "joint", *TOGETHER)
 # Not in `make test-fast`: folders and files that start processes, render captures or fit sequences,
 # and files that take more than some 3 s (`--durations`, warm kernels).
 SLOW = (
@@ -114,7 +110,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             path = nodeid.partition("::")[0]
-            return TOGETHER.get(path.split("/")[1], path)
+            folder = path.split("/")[1]
+            return folder if folder in TOGETHER else path
 
     return Scheduling(config, log)
 
