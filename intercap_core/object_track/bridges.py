@@ -186,8 +186,11 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
         if b == a + 1:
             continue
         frames = np.arange(a + 1, b)
-        step = (ends[1], b) if a < 0 else (ends[-2], a) if b == count else (a, b)
-        a, b = step if step == (a, b) else (step[1], step[1])
+        step = (a, b)
+        if a < 0:
+            step, a = (ends[1], b), b
+        elif b == count:
+            step, b = (ends[-2], a), a
         gap = Gap(observer.mesh, track, times, observer.joints, frames, a, b, step)
         path, fits, is_sure = _choose_path(observer, gap.bridges())
         track[frames] = [fit.pose for fit in fits] if fits else path.poses

@@ -250,7 +250,7 @@ export class Saving {
       ending && run.ending_s <= run.ends_within_s ? null : button(ending ? "Force stop" : "Stop", () => this.stop())];
   }
 
-  /* Each entry of the annotation beside the result, those that differ first. */
+  /* Each entry of the annotation with the result, those that differ first. */
   #editsPart() {
     const { edits } = this.comparison, differ = edits.filter(({ same }) => !same).length;
     return [make("h3", {}, differ ? `The result differs from ${differ} of ${edits.length} entries of the annotation` : `The result agrees with all ${edits.length} entries of the annotation`),

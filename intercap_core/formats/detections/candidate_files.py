@@ -111,7 +111,7 @@ def read_camera(
 ) -> CandidatesByImage:
     """Read all candidates of one camera.
 
-    Raises UserError for files of single images beside one of all images.
+    Raises UserError if a camera has a file of all images and also files of single images.
 
     Args:
         folder: folder of candidates of the sequence.

@@ -302,7 +302,7 @@ def find_json_files(folder: Path) -> list[Path]:
 
 
 def refuse_both(whole: Path | None, files: Collection[Path]) -> None:
-    """Raise UserError if a camera has files of single images beside a file of all images."""
+    """Raise UserError if a camera has a file of all images and also files of single images."""
     first = next(iter(sorted(files)), None)
     if whole is not None and first is not None and first.parent.parent == whole.parent:
         raise UserError(

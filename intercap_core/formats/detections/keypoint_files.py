@@ -329,7 +329,7 @@ def read_camera(
     """Read all keypoints of one camera.
 
     Raises UserError if files can be loaded and none can be used, for two files of one image, for
-    files of single images beside one of all images, or for points whose layout cannot be
+    a file of all images and also files of single images, or for points whose layout cannot be
     recognised. Files that cannot be loaded are noted.
 
     Args:

@@ -49,12 +49,12 @@ def _rays(lens: Intrinsics, distortion: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    """A camera with depth on the colour image's grid, and one with a depth camera beside it."""
+    """A camera with depth on the colour image's grid, and one with a separate depth camera."""
     between = rigid(cv2.Rodrigues(np.array([0.05, -0.03, 0.02]))[0], np.array([0.04, -0.01, 0.005]))
     return Rig(
         (
             Camera("grid", COLOUR, COLOUR, np.eye(4), np.eye(4)),
-            Camera("beside", COLOUR, DEPTH, between, np.eye(4)),
+            Camera("separate", COLOUR, DEPTH, between, np.eye(4)),
         )
     )
 
@@ -85,7 +85,7 @@ def written(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Pa
             names = images.name_images(frames, scenes)
             assert names == [{0: "000000.png"}, {0: "000000.jpg"}]
             images.write(folder / str(undistort), frames, rig, scenes, names, {"bop", "coco"})
-    for name, kind in zip(("grid/000000.png", "beside/000000.jpg"), kinds, strict=True):
+    for name, kind in zip(("grid/000000.png", "separate/000000.jpg"), kinds, strict=True):
         assert (folder / "False" / "coco" / name).read_bytes() == kind
     return {undistort: folder / str(undistort) for undistort in (False, True)}
 

@@ -189,7 +189,7 @@ def compare_bones(
 
     Args:
         people: keypoints (P, 135, 3) in the shared order.
-        statistic: length (P,) that stands for the lengths (P, B) of a person's bones, NaN = unseen.
+        statistic: one length (P,) for the lengths (P, B) of a person's bones, NaN = unseen.
     """
     body = people[:, BODY]
     seen = visible(body)
