@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import calibration_readers
 from intercap_core.formats.detections.candidate_files import holds_instances
 from intercap_core.formats.detections.keypoint_files import holds_people
+from intercap_core.formats.detections.mask_files import is_mask
 from intercap_core.formats.recordings.layouts import open_layout, recognise_recordings
-from intercap_core.formats.recordings.plain import IMAGE_SUFFIXES
+from intercap_core.formats.recordings.plain import IMAGE_SUFFIXES, find_images
 from intercap_core.geometry.rigid.mesh_files import SUFFIXES as MESH_SUFFIXES
 from intercap_core.inputs.documents import read_yaml
 from intercap_core.schemas import TRUTH
@@ -44,6 +46,8 @@ class Recording:
     layout: LayoutName
     cameras: list[str]
     """Names of the cameras."""
+    home: Path = Path()
+    """Highest folder that holds these recordings alone."""
 
     def entry(self, calibration: Path) -> SequenceEntry:
         """The row of the table of sequences, as far as it is needed to open the recordings."""
@@ -51,6 +55,13 @@ class Recording:
             sequence="s", subject="s", recordings=self.folder, layout=self.layout,
             calibration=calibration,
         )  # fmt: skip
+
+    def holds_masks(self) -> bool:
+        """Whether the images of all cameras are masks, by one image of each camera."""
+        if self.layout != "plain":
+            return False
+        images = [files[len(files) // 2] for files in find_images(self.folder).values()]
+        return bool(images) and all(map(is_mask, images))
 
 
 def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -> Draft:
@@ -64,7 +75,10 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
         dataset: name of the project.
         objects: objects.yaml to use; None = found in ``root``, or written for its meshes.
     """
-    recordings = list(find_recordings(root))
+    found = list(find_recordings(root))
+    masks = [recording.folder for recording in found if recording.holds_masks()]
+    masks = masks if len(masks) < len(found) else []
+    recordings = [recording for recording in found if recording.folder not in masks]
     if not recordings:
         raise UserError(
             f"{root}: holds no recordings that are recognised; expected Azure Kinect files, a "
@@ -74,8 +88,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
     result = Draft(dataset)
     used = frozenset(recording.folder for recording in recordings)
     result.objects = objects or _objects(sources.meshes or root, used, result.remarks)
-    names = _names(result.objects)
-    if not names:
+    if not _names(result.objects):
         result.remarks.append(
             f"{FILL_IN} no mesh ({', '.join(MESH_SUFFIXES)}) is found, so only the person is "
             "fitted; add the objects to objects.yaml and to the column object"
@@ -84,15 +97,48 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
         f"{FILL_IN} gender (female, male or neutral) and height without shoes in metres (empty = "
         "unknown)"
     )
-    sequences = set(RESERVED_SEQUENCES)
+    held = Counter(place for folder in used for place in _near(root, folder))
     for recording in recordings:
-        row = _row(root, recording, used, sources, sequences)
-        _add_object(row, names)
-        subject = _SUBJECT.search(str(row.columns["sequence"]))
-        row.columns["subject"] = subject[1].lower() if subject else SUBJECT
-        result.subjects[str(row.columns["subject"])] = "neutral"
-        result.rows.append(row)
+        home = [place for place in _near(root, recording.folder) if held[place] == 1][-1]
+        result.rows.append(_row(root, replace(recording, home=home), used, sources))
+    _name_rows(result, [recording.folder.relative_to(root) for recording in recordings], root)
+    result.remarks += [
+        f"{folder}: holds masks, which no sequence uses; name it in the column candidates"
+        for folder in masks
+        if all(folder != row.columns.get("candidates") for row in result.rows)
+    ]
     return result
+
+
+def _name_rows(draft: Draft, folders: list[Path], root: Path) -> None:
+    """Name the sequences, their subjects and their objects after their folders below ``root``.
+
+    A last folder that all sequences have, such as ``recordings``, is left out of their names.
+    """
+    objects, taken = _names(draft.objects), set(RESERVED_SEQUENCES)
+    unknown: list[str] = []
+    names = {folder.name for folder in folders}
+    is_common = len(folders) > 1 == len(names) and not _find_object(folders[0].name, objects)
+    drops_last = is_common and all(len(folder.parts) > 1 for folder in folders)
+    for row, folder in zip(draft.rows, folders, strict=True):
+        parts = folder.parts or (root.resolve().name,)
+        usual = clean_name("_".join(parts[:-1] if drops_last else parts))
+        name = _unique_name([usual], taken)
+        if name != usual:
+            row.remarks.append(f"{usual} is the name of another sequence or of a folder of results")
+        text = clean_name("_".join(parts))
+        stated = _SUBJECT.search(text)
+        subject = stated[1].lower() if stated else SUBJECT
+        row.columns |= {"sequence": name, "subject": subject}
+        _add_object(row, text, objects)
+        draft.subjects[subject] = "neutral"
+        unknown += [] if stated else [name]
+    if unknown:
+        draft.subject_remarks.append(
+            f"{FILL_IN} the names of {len(unknown)} of {len(folders)} sequences (first: "
+            f"{unknown[0]}) state no subject such as s02, so their subject is {SUBJECT}; add a row "
+            "for each person, and name it in the column subject of sequences.tsv"
+        )
 
 
 def clean_name(text: str) -> str:
@@ -127,18 +173,10 @@ def _folders(folder: Path) -> list[Path]:
         return []
 
 
-def _row(
-    root: Path, recording: Recording, used: frozenset[Path], sources: Sources, taken: set[str]
-) -> Row:
-    """Row of a sequence, without object and subject; adds its name to ``taken``."""
+def _row(root: Path, recording: Recording, used: frozenset[Path], sources: Sources) -> Row:
+    """Row of a sequence, without its name, object and subject."""
     folder = recording.folder
-    parts = folder.relative_to(root).parts or (folder.resolve().name,)
-    usual = clean_name("_".join(parts))
-    name = _unique_name([usual], taken)
-    row = Row({"sequence": name, "layout": recording.layout, "recordings": folder})
-    if name != usual:
-        row.remarks.append(f"{usual} is the name of another sequence or of a folder of results")
-    row.cameras = recording.cameras
+    row = Row({"layout": recording.layout, "recordings": folder}, cameras=recording.cameras)
     row.columns["calibration"] = _find_calibration(row, root, recording, used)
     for kind in ("keypoints", "candidates"):
         found = _find_detections(kind, root, recording, used, getattr(sources, kind))
@@ -206,20 +244,20 @@ def _find_detections(
 ) -> Path | None:
     """The nearest folder with keypoints or candidates of one of the cameras, None if there is none.
 
-    It lies in the folder of the recordings; or it is named as that folder, or belongs to the only
-    recordings, in a folder above or in ``given``.
+    It lies in a folder that holds these recordings alone, or in a folder above or in ``given``,
+    where it has the path of the recordings or of their home.
     """
+    folder, home = recording.folder, recording.home
     places: list[Path] = []
-    for near in _near(root, recording.folder):
+    for near in _near(root, folder):
         below = [path for path in _folders(near) if path not in used]
         below.sort(key=lambda path: path.name != kind)
-        own = recording.folder.relative_to(near)
-        places += below if near == recording.folder else [path / own for path in below]
-        places += below if len(used) == 1 else []
+        places += [path / folder.relative_to(near) for path in below]
+        is_alone = near.is_relative_to(home)
+        places += below if is_alone else [path / home.relative_to(near) for path in below]
     if given is not None:
-        own = recording.folder.relative_to(root)
-        places = [given / own, given / recording.folder.name, *places]
-        places += [given] if len(used) == 1 else []
+        own = folder.relative_to(root), home.relative_to(root)
+        places = [given / own[0], given / folder.name, given / own[1], *places]
 
     def holds_keypoints(place: Path) -> bool:
         return any(holds_people(place, camera) for camera in recording.cameras)
@@ -274,15 +312,19 @@ def _names(objects: Path | dict[str, dict[str, Any]]) -> list[str]:
     return sorted(values, key=len, reverse=True) if isinstance(values, dict) else []
 
 
-def _add_object(row: Row, names: list[str]) -> None:
-    """Name the object that the sequence's name contains, or else the only one."""
-    sequence = str(row.columns["sequence"])
-    for name in names:
-        if re.search(rf"(^|[_-]){re.escape(name)}($|[_-])", sequence, re.IGNORECASE):
-            row.columns["object"] = name
-            return
-    if len(names) == 1:
-        row.columns["object"] = names[0]
+def _find_object(text: str, names: list[str]) -> str | None:
+    """The first object whose name is a part of the text."""
+    return next(
+        (n for n in names if re.search(rf"(^|[_-]){re.escape(n)}($|[_-])", text, re.IGNORECASE)),
+        None,
+    )
+
+
+def _add_object(row: Row, text: str, names: list[str]) -> None:
+    """Name the object that the text contains, or else the only one."""
+    found = names[0] if len(names) == 1 else _find_object(text, names)
+    if found is not None:
+        row.columns["object"] = found
     elif names:
         row.remarks.append(
             f"{FILL_IN} the name of the sequence contains no object; write one of "

@@ -16,6 +16,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.candidate_files import holds_instances
 from intercap_core.formats.detections.coco import HEAD_BYTES
 from intercap_core.formats.detections.keypoint_files import holds_people
+from intercap_core.formats.detections.mask_files import is_mask
 from intercap_core.project import Project, load_project
 from tests.helpers.plain_capture import CAMERAS, write_rig
 
@@ -37,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         images = write_rig(shots, SIZE, 60.0)
         for camera, path in images.items():
             for number in range(3):
-                picture = np.full((*SIZE[::-1], 3), 80, np.uint8)
+                picture = np.random.default_rng(number).integers(0, 255, (*SIZE[::-1], 3))
                 cv2.imwrite(str(path / f"{number:03d}.jpg"), picture)
             shutil.move(path, shots / camera)
         (shots / "recordings").rmdir()
@@ -94,7 +95,56 @@ def test_what_cannot_be_seen_is_marked_and_has_a_default(folder: Path) -> None:
     assert "FILL IN: gender" in Path("lab/subjects.tsv").read_text()
     table = Path("lab/sequences.tsv").read_text().splitlines()
     assert "FILL IN: the name of the sequence contains no object" in table[-2]
-    assert output.count("FILL IN") == 2
+    assert "the names of 1 of 2 sequences (first: walk) state no subject" in output
+    assert output.count("FILL IN") == 3
+
+
+def write_masks(folder: Path) -> None:
+    for camera in CAMERAS:
+        (folder / camera).mkdir(parents=True)
+        for number in range(3):
+            mask = cv2.circle(np.zeros(SIZE[::-1], np.uint8), (30, 20), 9 + number, 255, -1)
+            cv2.imwrite(str(folder / camera / f"{number:03d}.png"), mask)
+
+
+@pytest.mark.parametrize("masks", ["{sequence}/segmentation", "segmented/{sequence}"])
+def test_detections_beside_folders_of_recordings(folder: Path, masks: str) -> None:
+    """Sequences are named without the folder that all of them have; masks are no sequence."""
+    (folder / "s02_cup_drink").rename(folder / "ann_cup")
+    shutil.rmtree(folder / "candidates")
+    for name in ("ann_cup", "walk"):
+        (folder / name / "recordings").mkdir()
+        for camera in CAMERAS:
+            (folder / name / camera).rename(folder / name / "recordings" / camera)
+        write_masks(folder / masks.format(sequence=name))
+    output, project = init("--keypoints", str(folder / "keypoints"))
+    assert list(project.sequences) == ["ann_cup", "walk"]
+    ann, walk = project.sequences.values()
+    assert (ann.object, ann.keypoints) == ("cup", Path("captures/ann_cup/openpose"))
+    assert walk.keypoints == Path("captures/keypoints/walk")
+    for name, row in project.sequences.items():
+        assert row.candidates == Path("captures", masks.format(sequence=name))
+    assert "the names of 2 of 2 sequences (first: ann_cup) state no subject" in output
+    assert "2 of 2 sequences are ready to run" in output
+    write_masks(folder / "tried" / "walk")
+    assert "captures/tried/walk: holds masks, which no sequence uses" in init("--replace")[0]
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (np.repeat([[0, 255]], 40, 0).repeat(20, 1), True),
+        (np.repeat([[0, 1, 2, 3]], 40, 0).repeat([25, 10, 5, 3], 1), True),
+        (np.tile(np.arange(60), (40, 1)), False),  # a grey photograph
+        (np.maximum(np.random.default_rng(0).normal(0, 900, (480, 640)), 0), False),  # depth
+    ],
+)
+def test_masks_have_large_areas_of_few_values(
+    tmp_path: Path, image: np.ndarray, expected: bool
+) -> None:
+    depth = image.max() > 255
+    cv2.imwrite(str(tmp_path / "0.png"), image.astype(np.uint16 if depth else np.uint8))
+    assert is_mask(tmp_path / "0.png") == expected
 
 
 def test_meshes_and_recordings_of_one_name_get_different_names(folder: Path) -> None:

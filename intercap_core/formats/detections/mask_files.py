@@ -31,6 +31,7 @@ BEHAVE_PERSON = ("person_mask",)
 BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second is used if the first is missing
 
 SMOOTH_WIDTH = 5  # px, largest width of the smooth outline of a mask
+MAX_INSTANCES = 1000  # in one image; an image with more values is not a mask
 
 
 class MaskFile(NamedTuple):
@@ -73,6 +74,19 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
         if instance is not None:
             instances.append(instance)
     return instances
+
+
+def is_mask(path: Path) -> bool:
+    """Whether an image file is a mask: it has few values, two of which most of its pixels have.
+
+    Neither photographs nor depth are like that.
+    """
+    try:
+        sampled = _decode(read_content(path), numbered=True)[::4, ::4]
+    except DamagedImage:
+        return False
+    _, counts = np.unique(sampled, return_counts=True)
+    return len(counts) <= MAX_INSTANCES and bool(2 * np.sort(counts)[-2:].sum() > counts.sum())
 
 
 def _decode(content: bytes, numbered: bool) -> np.ndarray:
@@ -136,7 +150,7 @@ def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
         if is_grey:  # of the classes of a data set, 255 is the void
             image = np.where(image == 255, 0, image)
         values = np.unique(image)
-        if len(values) > 1000:  # an image with more instances is not a mask
+        if len(values) > MAX_INSTANCES:
             raise DamagedImage(
                 f"has {len(values)} different values, expected black and white or a number for "
                 "each instance"

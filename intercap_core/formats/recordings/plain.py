@@ -129,6 +129,12 @@ def find_cameras(recordings: Path) -> list[str]:
     return [name for name in recorded if CAMERA_NAME.fullmatch(name)]
 
 
+def find_images(recordings: Path) -> dict[str, list[Path]]:
+    """Colour files by camera, of the cameras that have a folder of images."""
+    folders, _ = _find_recordings(recordings)
+    return {name: folder.colour for name, folder in folders.items() if folder.colour}
+
+
 def _find_recordings(recordings: Path) -> tuple[dict[str, _CameraFolder], list[Path]]:
     """Folders with images by name, and videos."""
     below = sorted(path for path in recordings.iterdir() if not path.name.startswith("."))
