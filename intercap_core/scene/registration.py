@@ -128,30 +128,32 @@ class _Seen:
 
     surface: DepthSurface
     """All N points."""
-    moment: np.ndarray
-    """(N,) 10 m times the index of the moment: fourth coordinate in the search tree, so that points
-    of different moments are never matched."""
     tree: cKDTree
-    """Search tree over points and moments (N, 4)."""
-    queries: np.ndarray
-    """Rows of the points that are matched for the fit."""
-    held_out: np.ndarray
-    """Rows of the points that are matched for evaluation only."""
+    """Search tree over (N, 4): points and 10 m times the index of the moment, so that points of
+    different moments are never matched."""
+    queries: tuple[DepthSurface, np.ndarray]
+    """Points that are matched for the fit, and their fourth coordinates in the search tree."""
+    held_out: tuple[DepthSurface, np.ndarray]
+    """The same for points that are matched for evaluation only."""
 
     @classmethod
     def of(cls, surfaces: Sequence[tuple[int, DepthSurface]]) -> _Seen:
         """Join (moment, surface) pairs.
 
         A random quarter of the points is held out. At most 2500 points are matched for the fit and
-        625 are held out, which bounds the run time.
+        625 are held out, which bounds the run time. Both stay in the order of the surface, because
+        successive queries of the search tree are faster for neighbouring points.
         """
         surface = DepthSurface.joined([surface for _, surface in surfaces])
         # 10 m: beyond any search radius
         moment = np.repeat([10.0 * at for at, _ in surfaces], [len(s) for _, s in surfaces])
         tree = cKDTree(np.column_stack([surface.points, moment]), balanced_tree=False)
         order = np.random.default_rng(0).permutation(len(surface))
-        queries, held_out = np.delete(order, np.s_[::4])[:2500], order[::4][: 2500 // 4]
-        return cls(surface, moment, tree, queries, held_out)
+        queries, held_out = (
+            (surface.subset(rows), moment[rows])
+            for rows in (np.sort(np.delete(order, np.s_[::4])[:2500]), np.sort(order[::4][:625]))
+        )
+        return cls(surface, tree, queries, held_out)
 
 
 @dataclass(frozen=True)
@@ -295,13 +297,12 @@ class Registration:
         """
         source, target = (self.rig[c].moved(at.poses[c]).master_from_depth for c in (a, b))
         own, other = self._seen[kind][a], self._seen[kind][b]
-        rows = own.held_out if held_out else own.queries
-        queries, surface = own.surface.subset(rows), other.surface
+        (queries, moment), surface = own.held_out if held_out else own.queries, other.surface
         points = apply(source, queries.points - at.bias[a] * queries.rays)
         # the tree holds b's points with their depth bias, so the query points get the same bias
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
-        sought = np.column_stack([in_target * (1 + at.bias[b] / depth), own.moment[rows]])
+        sought = np.column_stack([in_target * (1 + at.bias[b] / depth), moment])
         distance, nearest = other.tree.query(sought, distance_upper_bound=SURFACE_SEARCH_M)
         hit = np.flatnonzero(np.isfinite(distance))
         nearest, points = nearest[hit], points[hit]
