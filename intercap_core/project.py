@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -41,6 +41,8 @@ class Project:
     """Rows of the table of subjects by name."""
     objects: dict[str, ObjectEntry]
     """Entries of the objects file by name."""
+    listed: frozenset[str] = frozenset()
+    """Names of all rows of the table of sequences, with excluded and faulty ones."""
 
     @property
     def results(self) -> Path:
@@ -87,12 +89,15 @@ class Project:
 
     def object_of(self, sequence: str) -> ObjectEntry | None:
         """The sequence's object; None for a person without an object."""
-        name = self.sequences[sequence].object
-        return None if name is None else self.objects[name]
+        return self.objects.get(self.sequences[sequence].object or "")
 
     def objects_named(self) -> list[str]:
         """Sorted names of the objects in the table of sequences."""
-        return sorted({row.object for row in self.sequences.values() if row.object is not None})
+        return sorted({row.object for row in self.sequences.values() if row.object in self.objects})
+
+    def subjects_named(self) -> list[str]:
+        """Sorted names of the people in the table of sequences."""
+        return sorted({row.subject for row in self.sequences.values()} & set(self.subjects))
 
     def annotation_path(self, sequence: str) -> Path:
         """Path of the sequence's annotation file, which need not exist."""
@@ -190,7 +195,7 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     UserError with the first fault of :func:`read_project`.
     """
     project, faults = read_project(path, overrides)
-    if project is None or faults:
+    if faults:
         more = len(faults) - 1
         hint = f" (and {more} more: intercap check {path} lists them)" if more else ""
         raise UserError(faults[0] + hint)
@@ -199,25 +204,25 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
 
 def read_project(
     path: Path, overrides: Mapping[str, Any] | None = None
-) -> tuple[Project | None, list[str]]:
+) -> tuple[Project, list[str]]:
     """Read a settings file and all its tables; returns the valid part and all faults.
 
     The faults name file, row and field. Those that others may follow from come first: settings,
-    people, objects, sequences, then missing files. The project has the valid entries of the
-    settings and the sequences whose row, subject and object are valid; None if there are none.
-    Raises UserError if the settings file cannot be read.
+    people, objects, sequences, then missing files. If there are faults, the project has the valid
+    settings, rows and entries, and rows whose ``subject`` or ``object`` it lacks ("" if the cell is
+    faulty). Raises UserError if the settings file cannot be read.
     """
     path = Path(path)
     faults: list[str] = []
     config = _read_config(path, overrides or {}, faults)
-    if config is None:
-        return None, faults
     subjects_table = tidy(path.parent / config.subjects)
     people = read_table(subjects_table, SubjectEntry, "subject", path, faults)
     objects_file = tidy(path.parent / config.objects)
     things = _read_objects(objects_file, path, faults)
     table = tidy(path.parent / config.sequences)
-    rows = read_table(table, SequenceEntry, "sequence", path, faults)
+    rows = read_table(
+        table, SequenceEntry, "sequence", path, faults, references=("subject", "object")
+    )
     listed: dict[str, tuple[Mapping[str, BaseModel | None], Path]] = {
         "subject": (people, subjects_table), "object": (things, objects_file),
     }  # fmt: skip
@@ -225,18 +230,15 @@ def read_project(
     for name, row in rows.items():
         if row is None:
             continue
-        named = {field: getattr(row, field) for field in listed if getattr(row, field) is not None}
-        for field, value in named.items():
-            known, file = listed[field]
-            if value not in known:
+        for field, (known, file) in listed.items():
+            value = getattr(row, field)
+            if value and value not in known:
                 faults.append(
                     f"{table}: sequence {name!r} has {field} {value!r}, which is not in "
                     f"the table of {field}s {file} ({_some(known) or 'empty'}); correct the "
                     f"name or add the {field}"
                 )
-        if name not in config.exclude and all(
-            listed[field][0].get(value) is not None for field, value in named.items()
-        ):
+        if name not in config.exclude:
             valid[name] = _absolute(row, table.parent)
     faults += [
         f"{path}: exclude names {name!r}, which {table} does not list"
@@ -250,12 +252,12 @@ def read_project(
         )
     subjects = {name: row for name, row in people.items() if row is not None}
     objects = {name: entry for name, entry in things.items() if entry is not None}
-    project = Project(config, path, valid, subjects, objects)
+    project = Project(config, path, valid, subjects, objects, frozenset(rows))
     faults += [*_faults_of_files(project), *_faults_of_studio(project, rows, table)]
-    return (project if valid else None), faults
+    return project, faults
 
 
-def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) -> Config | None:
+def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) -> Config:
     """The valid entries of a settings file, with absolute or working-directory-relative paths."""
     values = _or_empty(read_yaml(path))
     if not isinstance(values, dict):
@@ -268,15 +270,29 @@ def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) ->
         config = Config.model_validate(values)
     except ValidationError as error:
         faults += describe(error, str(path), "setting")
-        wrong = {fault["loc"][0] for fault in error.errors() if fault["loc"]}
-        left = {key: value for key, value in values.items() if key not in wrong}
-        try:
-            config = Config.model_validate({"dataset": "unnamed", **left})
-        except ValidationError:
-            return None
+        config = _valid_part(values)
     sections = {name: value for name, value in config if isinstance(value, BaseModel)}
     moved = {name: _absolute(value, path.parent) for name, value in sections.items()}
     return config.model_copy(update={**moved, "results": tidy(root_of(path) / config.results)})
+
+
+def _valid_part(values: Mapping[str, Any]) -> Config:
+    """The settings without the entries that are not valid."""
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        for fault in error.errors():
+            values = _without(values, fault["loc"])
+        return _valid_part({"dataset": "unnamed", **values})
+
+
+def _without(values: Mapping[str, Any], place: Sequence[int | str]) -> dict[str, Any]:
+    """Nested values without the entry at a place, or without the one that should hold it."""
+    left = dict(values)
+    inner = left.pop(str(place[0])) if place and place[0] in left else None
+    if isinstance(inner, dict) and len(place) > 1 and place[1] in inner:
+        left[str(place[0])] = _without(inner, place[1:])
+    return left
 
 
 def _some(names: Iterable[str]) -> str:
@@ -342,7 +358,7 @@ def _faults_of_bodies(project: Project) -> Iterator[str]:
     named = [gender for gender in ("female", "male") if getattr(models, gender) is not None]
     if not named or models.neutral is not None:
         return
-    for name in sorted({row.subject for row in project.sequences.values()}):
+    for name in project.subjects_named():
         gender = project.subjects[name].gender
         if models.of(gender) is None:
             yield (

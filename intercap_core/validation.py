@@ -48,11 +48,17 @@ def describe(error: ValidationError, where: str, what: str) -> list[str]:
 
 
 def read_table(
-    path: Path, model: type[M], key: str, settings: Path, faults: list[str]
+    path: Path,
+    model: type[M],
+    key: str,
+    settings: Path,
+    faults: list[str],
+    references: Sequence[str] = (),
 ) -> dict[str, M | None]:
     """Read a tab-separated table with a header; returns its rows by name, None for faulty rows.
 
-    Empty lines and lines that begin with # are skipped.
+    Empty lines and lines that begin with # are skipped. A row whose only faults are references is
+    returned with "" in their place.
 
     Args:
         path: file of the table.
@@ -60,6 +66,7 @@ def read_table(
         key: column with unique names.
         settings: settings file that names the table, for messages.
         faults: gets one message for each fault.
+        references: columns that name rows of other tables.
     """
     try:
         lines = read_text(path).splitlines()
@@ -91,7 +98,18 @@ def read_table(
             faults.append(f"{where}: the number of columns differs from the header; use tabs")
             rows.setdefault(name, None)
             continue
-        row = parse_entry(model, {k: v for k, v in record.items() if v}, where, "column", faults)
+        record = {column: cell for column, cell in record.items() if cell}
+        try:
+            row: M | None = model.model_validate(record)
+        except ValidationError as error:
+            faults += describe(error, where, "column")
+            wrong = {str(part) for fault in error.errors() for part in fault["loc"] or [""]}
+            row = None
+            if wrong <= {*references}:
+                row = parse_entry(
+                    model, record | dict.fromkeys(wrong, name), where, "column", faults
+                )
+                row = row and row.model_copy(update=dict.fromkeys(wrong, ""))
         if row is not None and name in seen:
             faults.append(f"{where}: line {seen[name]} has the same name; names must differ")
             continue

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +17,7 @@ from intercap_core.project import Project, read_project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.commands.check_recordings import RecordingFindings
+    from intercap_core.config import BodyModels
 
 
 @dataclass(frozen=True)
@@ -35,36 +38,60 @@ def check_bodies(project: Project) -> None:
 
     Raises UserError if one of them cannot be opened.
     """
-    lemo = project.config.joint.lemo_files
-    if lemo is not None:
-        from intercap_core.body.lemo import MotionEncoder
+    for check in _body_checks(project):
+        check()
 
-        MotionEncoder.load(*lemo)
-    models = project.config.body_models
-    genders = {project.subjects[row.subject].gender for row in project.sequences.values()}
+
+def _body_checks(project: Project) -> list[Callable[[], None]]:
+    """A check for each body file and prior that exists; missing files are faults already."""
+    models, lemo = project.config.body_models, project.config.joint.lemo_files or ()
+    genders = {project.subjects[name].gender for name in project.subjects_named()}
     files = sorted({path for gender in genders if (path := models.of(gender)) is not None})
-    if not files and models.vposer is None:
-        return  # without importing torch
-    from intercap_core.body.artefact import load_pose_prior
+    checks: list[Callable[[], None]]
+    checks = [partial(_check_body, path) for path in files if path.is_file()]
+    if models.vposer is not None and models.vposer.is_file():
+        checks.append(partial(_check_pose_prior, models))
+    if lemo and all(path.is_file() for path in lemo):
+        checks.append(partial(_check_motion_prior, lemo))
+    return checks
+
+
+# These import torch.
+def _check_body(path: Path) -> None:
     from intercap_core.body.model import BodyModel, check_body
 
-    for path in files:
-        check_body(BodyModel.load(path))
-    if models.vposer is not None:
-        load_pose_prior(models, BodyModel.load())
+    check_body(BodyModel.load(path))
 
 
-def check_detector(project: Project) -> list[Fault]:
-    """Open the detectors that the settings name; returns objects without a matching class.
+def _check_pose_prior(models: BodyModels) -> None:
+    from intercap_core.body.artefact import load_pose_prior
+    from intercap_core.body.model import BodyModel
 
-    Raises UserError if a model cannot run on this machine.
-    """
+    load_pose_prior(models, BodyModel.load())
+
+
+def _check_motion_prior(files: tuple[Path, Path]) -> None:
+    from intercap_core.body.lemo import MotionEncoder
+
+    MotionEncoder.load(*files)
+
+
+def check_keypoint_model(project: Project) -> None:
+    """Open the keypoint model; raises UserError if it cannot run on this machine."""
     settings = project.config.detections
-    if settings.keypoint_model is not None:
+    if settings.keypoint_model is not None and settings.keypoint_model.is_file():
         from intercap_core.formats.detections.onnx_pose import PoseModel
 
         PoseModel.load(settings)
-    if settings.segmentation_model is None:
+
+
+def check_segmentation_model(project: Project) -> list[Fault]:
+    """Open the segmentation model; returns objects that are none of its classes.
+
+    Raises UserError if the model cannot run on this machine.
+    """
+    settings = project.config.detections
+    if settings.segmentation_model is None or not settings.segmentation_model.is_file():
         return []
     from intercap_core.commands.check_recordings import list_labels
     from intercap_core.formats.detections.onnx_segmentation import Segmenter
@@ -95,7 +122,7 @@ class Findings:
     summaries: list[Fault] = field(default_factory=list)
     """One line per usable recording."""
     sequences: int = 0
-    """Number of the sequences whose rows are valid."""
+    """Number of the sequences in the table."""
     ready: int = 0
     """Number of the sequences that can run."""
 
@@ -110,14 +137,13 @@ def check_project(settings: Path) -> Findings:
     """Check settings, tables, the files that they name, and all sequences, in one pass."""
     project, faults = read_project(settings)
     findings = Findings([Fault("", message) for message in faults])
-    if project is None:
-        return findings
-    findings.sequences = len(project.sequences)
-    if not faults:  # a missing model is a fault already
-        for check in (check_bodies, check_detector):
-            try:
-                findings.notes += check(project) or []
-            except UserError as error:
+    findings.sequences = len(project.listed - set(project.config.exclude))
+    checks = [partial(check, project) for check in (check_keypoint_model, check_segmentation_model)]
+    for check in (*_body_checks(project), *checks):
+        try:
+            findings.notes += check() or []
+        except UserError as error:
+            if str(error) not in faults:
                 findings.faults.append(Fault("", str(error)))
     findings.faults += [Fault("", message) for message in fault_of_results(project)]
     found = check_sequences(project)
@@ -166,7 +192,7 @@ def check_sequences(project: Project) -> Findings:
                 raise UserError(f"{path}: {problem}; correct the entry")
         except UserError as error:
             faults.append(Fault(name, str(error)))
-        mesh = None if row.object is None else meshes[row.object]
+        mesh = meshes.get(row.object or "")
         if mesh is not None:
             faults.append(Fault(name, mesh))
         if project.recordings_made(name) is not None:
@@ -196,7 +222,7 @@ def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str
 def _check_annotations(project: Project, findings: Findings) -> None:
     """Add a fault for each YAML file that no sequence reads, and notes on other files."""
     folder = tidy(project.path.parent / project.config.annotations)
-    known = {folder / f"{name}.yaml" for name in (*project.sequences, *project.config.exclude)}
+    known = {folder / f"{name}.yaml" for name in project.listed}
     known |= {project.annotation_path(name) for name in project.sequences}
     unread = [path for path in list_files(folder) if path not in known and path.parent == folder]
     yaml = [path for path in unread if path.suffix.lower() in (".yaml", ".yml")]

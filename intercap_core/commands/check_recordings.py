@@ -319,7 +319,7 @@ def _notes_on_object(
     """Note that neither depth nor candidates show the object, [] if one of them does."""
     has_model = project.config.detections.segmentation_model is not None
     folder = row.candidates
-    if row.object is None or has_model or findings.depth or row.layout == "behave":
+    if not row.object or has_model or findings.depth or row.layout == "behave":
         return []
     if folder is not None and any(
         candidate_files.has_candidates(folder, name, row.layout) for name in cameras

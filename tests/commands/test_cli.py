@@ -22,7 +22,7 @@ from rich.console import Console
 
 from intercap_core import artefacts, cli
 from intercap_core.commands.check import (
-    check_detector,
+    check_segmentation_model,
     check_sequences,
 )
 from intercap_core.commands.console import ListTable
@@ -222,24 +222,42 @@ def test_check_lists_the_faults_of_all_files_in_one_pass(small_project: Path) ->
     """Settings, people, objects and sequences come first, in this order; then the recordings."""
     (small_project / "config.yaml").write_text(
         "dataset: trial\njoint: {contact_weight: -1}\nscene: {floor: 1}\n"
+        "body_models: {male: body.npz, sex: male}\n"
     )
+    (small_project / "body.npz").write_text("not a body")
+    (small_project / "annotations" / "three.yaml").touch()
     (small_project / "subjects.tsv").write_text("subject\tgender\ns01\tmale\ns02\tM\n")
     (small_project / "objects.yaml").write_text("cup: {mesh: cup.ply}\nmug: {}\n")
     with (small_project / "sequences.tsv").open("a") as table:
         table.write("two\ts02\tcup\trec\trig.json\tpoints\n")
         table.write("three\ts09\tmug\trec\trig.json\tpoints\nbad\ts01\n")
+        table.write("four\t\tcup\tnowhere\trig.json\t\n")
     done = intercap("check", "config.yaml", folder=small_project)
-    assert done.returncode == 1 and "0 of 3 sequences are ready" in done.stdout
+    assert done.returncode == 1 and "0 of 6 sequences are ready" in done.stdout
     expected = [
-        ("config.yaml", "scene.floor"), ("config.yaml", "joint.contact_weight"),
+        ("config.yaml", "body_models.sex"), ("config.yaml", "scene.floor"),
+        ("config.yaml", "joint.contact_weight"),
         ("subjects.tsv, line 3", "gender"), ("objects.yaml, object 'mug'", "mesh"),
-        ("sequences.tsv, line 7", "number of columns"), ("'three'", "subject 's09'"),
+        ("sequences.tsv, line 7", "number of columns"),
+        ("sequences.tsv, line 8 (sequence 'four')", "column subject"),
+        ("'three'", "subject 's09'"), ("Body file body.npz", "not a readable"),
         ("sequence 'bad'", "annotations/bad.yaml"),
     ]  # fmt: skip
     lines = done.stderr.splitlines()
     for line, parts in zip(lines, expected, strict=False):
         assert line.startswith("problem: ") and all(part in line for part in parts), line
-    assert len(lines) == len(expected) + 3  # the other faults of the recordings
+    assert len(lines) == len(expected) + 4  # the other faults of the recordings
+    assert "sequence 'four': column recordings names nowhere" in lines[-1]
+    for name in ("two", "three"):
+        assert f"sequence {name!r}: 1 camera; 1280x720" in done.stdout
+
+
+def test_check_goes_on_if_no_row_is_valid(small_project: Path) -> None:
+    (small_project / "subjects.tsv").write_text("subject\tgender\n")
+    (small_project / "results").write_text("a file")
+    problems = intercap("check", "config.yaml", folder=small_project).stderr
+    for part in ("results/trial: the folder", "'bad': annotations/bad.yaml", "'empty': . contains"):
+        assert part in problems
 
 
 def test_paths_do_not_depend_on_the_working_directory(
@@ -430,7 +448,7 @@ def test_check_notes_objects_unknown_to_the_model(
         Path("objects.yaml").write_text(
             yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": labels}})
         )
-        notes = check_detector(load_project(Path("config.yaml"), settings))
+        notes = check_segmentation_model(load_project(Path("config.yaml"), settings))
         assert len(notes) == count
         assert not notes or "(suitcase, cup) is a label of object 'cup' (mug)" in str(notes[0])
 

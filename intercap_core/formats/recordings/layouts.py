@@ -59,7 +59,7 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
     """Notes on files in the folder of recordings that the layout does not read.
 
     Files with suffixes of text and data, unless they are named after times, and hidden ones are
-    left out.
+    left out, as are folders that other columns of the row name.
     """
     from intercap_core.formats.recordings import plain, timestamps
 
@@ -74,6 +74,7 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
         pattern = pattern.replace(f"{{{name}}}", f"({'|'.join(map(re.escape, texts))})")
     pattern = pattern.replace("{camera}", CAMERA_NAME.pattern)
     is_read = re.compile(pattern, re.IGNORECASE)
+    named = {sequence.keypoints, sequence.candidates, sequence.results, sequence.calibration}
     unread = []
     for folder, below, names in os.walk(sequence.recordings, followlinks=True):
         relative = Path(folder).relative_to(sequence.recordings)
@@ -82,6 +83,7 @@ def list_unread(sequence: SequenceEntry) -> list[str]:
             name
             for name in sorted(below)
             if not name.startswith(".")
+            and Path(folder, name) not in named
             and len(relative.parts) < _DEEPEST
             and not is_read.fullmatch(f"{place}{name}/")
         ]

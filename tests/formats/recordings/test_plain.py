@@ -422,6 +422,14 @@ def test_files_that_nothing_reads_are_listed(capture, place, count):
     assert used in note and "not used; layout plain reads" in note
 
 
+def test_folders_of_other_columns_are_not_listed(capture):
+    masks = capture.recordings / "masks"
+    (masks / "left" / "cup").mkdir(parents=True)
+    (masks / "left" / "cup" / "0000.png").write_bytes(b"")
+    assert "masks/left/cup/0000.png is not used" in list_unread(capture)[0]
+    assert list_unread(capture.model_copy(update={"candidates": masks})) == []
+
+
 def test_images_are_found_without_a_call_for_each(capture, monkeypatch):
     paths, stat = [], Path.stat
     monkeypatch.setattr(Path, "stat", lambda path, **o: paths.append(path) or stat(path, **o))
