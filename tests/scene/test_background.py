@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.scene.background import Background, steady_background
@@ -44,3 +45,27 @@ def test_samples_are_few_and_evenly_spaced():
     frames = sample_evenly(available, 25)
     assert len(frames) == 25 and available[frames].all() and frames[-1] > 2900
     np.testing.assert_array_equal(sample_evenly(np.array([True, False, True]), 25), [0, 2])
+
+
+@pytest.mark.parametrize("samples", [1, 2, 7, 25])
+def test_background_is_the_median_of_the_farthest_cluster(samples: int):
+    rng = np.random.default_rng(samples)
+    images = (1000 + 40 * rng.integers(0, 5, (samples, 20, 30))).astype(np.uint16)
+    images += rng.integers(0, 8, images.shape).astype(np.uint16)
+    images[rng.random(images.shape) < 0.2] = 0
+    background = background_of(images)
+    for seen, depth, static in zip(
+        images.reshape(samples, -1).T, background.depth.flat, background.static.flat, strict=True
+    ):
+        valid = np.sort(seen[seen > 0]).astype(float)
+        share = 0.2 if len(valid) >= 0.75 * samples else 0.8
+        count = max(int(np.ceil(share * len(valid))), min(2, samples))
+        cluster = np.zeros(0)
+        for first in range(len(valid) - count, -1, -1):
+            low, high = valid[first], valid[first + count - 1]
+            tolerance = 8 + 0.004 * (low + high) / 2
+            if high - low <= tolerance:
+                cluster = valid[np.abs(valid - (low + high) / 2) <= tolerance]
+                break
+        assert depth == (cluster[len(cluster) // 2] if len(cluster) else 0)
+        assert static == (len(cluster) > 0.5 * max(len(valid), samples / 2))
