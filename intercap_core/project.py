@@ -269,7 +269,7 @@ def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) ->
     try:
         config = Config.model_validate(values)
     except ValidationError as error:
-        faults += describe(error, str(path), "setting")
+        faults += describe(error, Config, str(path), "setting")
         config = _valid_part(values)
     sections = {name: value for name, value in config if isinstance(value, BaseModel)}
     moved = {name: _absolute(value, path.parent) for name, value in sections.items()}

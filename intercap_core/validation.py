@@ -2,15 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from intercap_core.inputs.files import UnreadableFile, printable, quoted, read_text
 
 M = TypeVar("M", bound=BaseModel)
+
+# Expected values by the kind of pydantic's errors <kind>_type and <kind>_parsing
+_KINDS = {
+    "float": "a number", "int": "a whole number", "bool": "true or false", "string": "text",
+    "path": "a path", "list": "a list", "tuple": "a list", "dict": "names and values",
+    "model": "names and values", "model_attributes": "names and values",
+}  # fmt: skip
+_EXPECTATIONS = {
+    "finite_number": "must be a finite number",
+    "greater_than": "must be above {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "int_from_float": "must be a whole number",
+    "less_than": "must be below {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "literal_error": "must be {expected}",
+    "string_pattern_mismatch": (
+        "a name has letters, digits, _ and - only, and does not start with -"
+    ),
+    "string_too_long": "must have at most {max_length} characters",
+    "too_long": "must have at most {max_length} entries",
+    "too_short": "must have at least {min_length} entries",
+}
 
 
 def parse_entry(model: type[M], values: Any, where: str, what: str, faults: list[str]) -> M | None:
@@ -29,22 +53,59 @@ def parse_entry(model: type[M], values: Any, where: str, what: str, faults: list
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        faults += describe(error, where, what)
+        faults += describe(error, model, where, what)
         return None
 
 
-def describe(error: ValidationError, where: str, what: str) -> list[str]:
+def describe(error: ValidationError, model: type[BaseModel], where: str, what: str) -> list[str]:
     """One message for each fault that a model has found; arguments as of :func:`parse_entry`."""
     messages = []
     for fault in error.errors(include_url=False):
-        field = ".".join(str(part)[:80] for part in fault["loc"]) or "(the whole entry)"
-        message = fault["msg"].removeprefix("Value error, ")[:400]
-        if fault["type"] == "string_pattern_mismatch":
-            message = "a name has letters, digits, _ and - only, and does not start with -"
+        parts = [str(part)[:80] for part in fault["loc"] if "[" not in str(part)]  # tags of unions
+        field = ".".join(parts) or "(the whole entry)"
         found = fault.get("input")
         shown = "" if isinstance(found, dict) else f", found {quoted(found)}"
-        messages.append(f"{where}: {printable(f'{what} {field}: {message}{shown}')}; correct it")
+        if fault["type"] == "missing":
+            text = "missing; add it"
+        elif fault["type"] == "extra_forbidden":
+            similar = _similar(str(fault["loc"][-1]), model)
+            hint = f" (similar: {', '.join(similar)})" if similar else ""
+            text = f"no such {what}{hint}; config/README.md lists them"
+        else:
+            text = f"{_expectation(fault)[:400]}{shown}; correct it"
+        messages.append(f"{where}: {printable(f'{what} {field}: {text}')}")
     return messages
+
+
+def _expectation(fault: ErrorDetails) -> str:
+    """What a model expects instead of a value; its own words for errors of its validators."""
+    kind, _, problem = fault["type"].rpartition("_")
+    if problem in ("parsing", "type") and kind in _KINDS:
+        return f"must be {_KINDS[kind]}"
+    form = _EXPECTATIONS.get(fault["type"], fault["msg"].removeprefix("Value error, "))
+    return form.format(**fault.get("ctx", {})) if fault["type"] in _EXPECTATIONS else form
+
+
+def _similar(name: str, model: type[BaseModel]) -> list[str]:
+    """Fields with the most similar name, of the model and of those in it."""
+    places = list(_fields(model))
+    closest = get_close_matches(name, {place.rpartition(".")[2] for place in places}, n=1)
+    return [place for place in places if place.rpartition(".")[2] in closest][:3]
+
+
+def _fields(model: type[BaseModel], above: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        yield f"{above}{name}"
+        for inner in _models(field.annotation):
+            yield from _fields(inner, f"{above}{name}.")
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Models in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models(part)
 
 
 def read_table(
@@ -102,7 +163,7 @@ def read_table(
         try:
             row: M | None = model.model_validate(record)
         except ValidationError as error:
-            faults += describe(error, where, "column")
+            faults += describe(error, model, where, "column")
             wrong = {str(part) for fault in error.errors() for part in fault["loc"] or [""]}
             row = None
             if wrong <= {*references}:
