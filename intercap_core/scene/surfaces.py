@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -64,38 +65,65 @@ def surface_from_depth(
 
     ``cell_m``: side of a cubic cell, metres.
     """
-    rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
-    if not len(rows):
-        rows = columns = np.zeros(1, int)
-    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    depth, table = depth[window], lens.rays[window]
-    usable = (depth > 0) & (depth <= max_depth_m * 1000)
-    z = depth.astype(np.float32) * np.float32(1e-3)
-    grid = np.dstack([table * z[..., None], z])
     # Distance of the neighbours on either side: 4 px of the unbinned narrow mode (f = 504 px).
     # With closer ones noise dominates, with farther ones edges; tuned on the studio.
     step = max(1, round(0.008 * lens.fx))
-    middle = np.s_[step:-step, step:-step]
-    left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
-    up, down = np.s_[: -2 * step, step:-step], np.s_[2 * step :, step:-step]
-    flat = usable[middle].copy()
-    for one, other in ((left, right), (up, down)):
-        flat &= usable[one] & usable[other]
-        kink = np.abs((z[one] + z[other]) / 2 - z[middle])
-        flat &= kink <= 0.008 * z[middle]  # share of depth; tuned on the studio
-    row, column = np.nonzero(flat)
-    row, column = row + step, column + step
-    points = grid[row, column].astype(np.float64)
-    across = grid[row, column + step] - grid[row, column - step]
-    along = grid[row + step, column] - grid[row - step, column]
-    normals = np.cross(along, across).astype(np.float64)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
-    # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
-    good = np.isfinite(points).all(1) & (facing >= 0.26)
-    along_z = np.column_stack([table[row, column], np.ones(len(row))])
-    still = np.zeros(np.count_nonzero(good))
-    return thin_surface(DepthSurface(points[good], normals[good], along_z[good], still), cell_m)
+    points, normals, rays = _oriented_points(depth, lens.rays, step, max_depth_m * 1000)
+    return thin_surface(DepthSurface(points, normals, rays, np.zeros(len(points))), cell_m)
+
+
+@numba.njit(cache=True)
+def _oriented_points(
+    depth: np.ndarray, rays: np.ndarray, step: int, max_mm: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Kernel of :func:`surface_from_depth`: points, normals and rays (N, 3) before thinning.
+
+    Args:
+        depth: (H, W) uint16 mm.
+        rays: (H, W, 2) float32 of the lens; NaN = outside its calibration.
+        step: distance of the neighbours that determine a normal, px.
+        max_mm: largest depth.
+    """
+    height, width = depth.shape
+    points, normals, along = np.empty((3, depth.size, 3))
+    count = 0
+    for v in range(step, height - step):
+        for u in range(step, width - step):
+            usable = 0 < depth[v, u] <= max_mm
+            for side in ((v, u - step), (v, u + step), (v - step, u), (v + step, u)):
+                usable = usable and 0 < depth[side] <= max_mm
+            if not usable:
+                continue
+            px, py, pz = _point_of(depth, rays, v, u)
+            left, right = _point_of(depth, rays, v, u - step), _point_of(depth, rays, v, u + step)
+            up, down = _point_of(depth, rays, v - step, u), _point_of(depth, rays, v + step, u)
+            kink = max(
+                abs((left[2] + right[2]) / np.float32(2) - pz),
+                abs((up[2] + down[2]) / np.float32(2) - pz),
+            )
+            if kink > np.float32(0.008) * pz:  # share of depth; tuned on the studio
+                continue
+            ax, ay, az = down[0] - up[0], down[1] - up[1], down[2] - up[2]
+            bx, by, bz = right[0] - left[0], right[1] - left[1], right[2] - left[2]
+            normal = normals[count]
+            normal[:] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            normal /= max(np.sqrt((normal * normal).sum()), 1e-12)
+            point = points[count]
+            point[:] = px, py, pz
+            # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
+            if -(normal * point).sum() >= 0.26 * np.sqrt((point * point).sum()):  # False for NaN
+                along[count] = rays[v, u, 0], rays[v, u, 1], np.float32(1)
+                count += 1
+    return points[:count], normals[:count], along[:count]
+
+
+@numba.njit(cache=True)
+def _point_of(
+    depth: np.ndarray, rays: np.ndarray, v: int, u: int
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Point of pixel (v, u), metres; see :func:`_oriented_points`."""
+    z = np.float32(depth[v, u]) * np.float32(1e-3)
+    return rays[v, u, 0] * z, rays[v, u, 1] * z, z
 
 
 def thin_surface(surface: DepthSurface, cell_m: float) -> DepthSurface:
@@ -156,16 +184,17 @@ def moving_surfaces(
     depth_image = np.where((image_of >= 0) & has_depth, image_of, -1)
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
     whole[1:-1] = (depth_image[:-2] >= 0) & (depth_image[1:-1] >= 0) & (depth_image[2:] >= 0)
+    limits = [None if b is None else _nearest_background(b) for b in backgrounds]
     result = []
     for t in sample_evenly(whole.sum(1) >= 2, 16):
         at_once = {}
         for c in np.flatnonzero(whole[t]):
-            background, lens = backgrounds[c], rig[int(c)].depth
-            if background is None or lens is None:
+            limit, lens = limits[c], rig[int(c)].depth
+            if limit is None or lens is None:
                 continue
             images = [frames.depth(int(depth_image[k, c]), int(c)) for k in (t - 1, t, t + 1)]
             gaps = frames.time_s[[t, t + 1]] - frames.time_s[[t - 1, t]]
-            surface = _moving(images, background, lens, gaps)
+            surface = _moving(images, limit, lens, gaps)
             if len(surface):
                 at_once[int(c)] = surface
         if len(at_once) >= 2:
@@ -174,11 +203,18 @@ def moving_surfaces(
 
 
 def _moving(
-    images: list[np.ndarray | None], background: Background, lens: Intrinsics, gaps: np.ndarray
+    images: list[np.ndarray | None], limit: np.ndarray, lens: Intrinsics, gaps: np.ndarray
 ) -> DepthSurface:
-    """Foreground surface of the second of three depth images, with the mean speed over both
-    ``gaps`` (2,), seconds."""
-    before, now, after = (_foreground(image, background) for image in images)
+    """Foreground surface of the second of three depth images, with its mean speed.
+
+    Args:
+        images: (H, W) uint16 mm.
+        limit: (H, W) uint16 mm, see :func:`_nearest_background`.
+        gaps: (2,) seconds between the images.
+    """
+    before, now, after = (
+        np.where(image < limit, image, np.uint16(0)) for image in images if image is not None
+    )
     # cells of 2 cm, finer than those of the background
     surface = surface_from_depth(now, lens, cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M)
     if not len(surface):
@@ -189,22 +225,22 @@ def _moving(
     return replace(surface, speed=speed).subset(np.flatnonzero(np.isfinite(speed)))
 
 
-def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
-    """Depth (H, W), uint16 mm, of the pixels in front of the background; 0 for others."""
-    assert image is not None
+def _nearest_background(background: Background) -> np.ndarray:
+    """Depth (H, W), uint16 mm, from which on a measurement may be the background."""
     behind = background.depth
     # above the systematic error of 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and noise;
     # margins tuned on the studio
-    limit = behind * (1 - 0.012) - 40.0
-    return np.where((behind == 0) | (image < limit), image, 0).astype(np.uint16)
+    limit = np.ceil(behind * (1 - 0.012) - 40.0)
+    return np.where(behind == 0, 65535, np.maximum(limit, 0)).astype(np.uint16)
 
 
 def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """Points (N, 3), metres, of the valid pixels of a depth image (H, W), uint16 mm."""
     thin = np.s_[::2, ::2]  # every second pixel is enough
-    z = image[thin].astype(np.float64) * 1e-3
-    keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)  # margin for motion, metres
-    points = np.column_stack([lens.rays[thin][keep] * z[keep, None], z[keep]])
+    image = image[thin]
+    keep = (image > 0) & (image < 1000 * (MOVING_MAX_DEPTH_M + 0.3))  # margin for motion, metres
+    z = image[keep] * 1e-3
+    points = np.column_stack([lens.rays[thin][keep] * z[:, None], z])
     return points[np.isfinite(points).all(1)]
 
 

@@ -90,6 +90,35 @@ def test_surfaces_lie_on_the_room_and_face_the_camera():
         assert ((surface.normals * surface.points).sum(1) < 0).all()
 
 
+def test_normals_are_cross_products_of_central_differences():
+    lens = TRUTH[0].depth
+    depth = to_millimetres(room(True)[0], np.random.default_rng(0), noise=0.3)
+    step = max(1, round(0.008 * lens.fx))
+    grid = (
+        np.dstack([lens.rays, np.ones(depth.shape, np.float32)])
+        * (depth * np.float32(1e-3))[..., None]
+    )
+    middle = grid[step:-step, step:-step]
+    left, right = grid[step:-step, : -2 * step], grid[step:-step, 2 * step :]
+    up, down = grid[: -2 * step, step:-step], grid[2 * step :, step:-step]
+    flat = np.ones(middle.shape[:2], bool)
+    for one, other in ((left, right), (up, down)):
+        flat &= (
+            np.abs((one + other)[..., 2] / 2 - middle[..., 2]) <= np.float32(0.008) * middle[..., 2]
+        )
+    for side in (middle, left, right, up, down):
+        flat &= (side[..., 2] > 0) & (side[..., 2] <= 5.0)
+    normals = np.cross(down - up, right - left)[flat]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = middle[flat]
+    towards = -(normals * points).sum(1) / np.linalg.norm(points, axis=1) >= 0.26
+    # cells are so small that no two points share one
+    surface = surface_from_depth(depth, lens, cell_m=1e-4, max_depth_m=5.0)
+    order, expected = np.lexsort(surface.points.T), np.lexsort(points[towards].T)
+    np.testing.assert_allclose(surface.points[order], points[towards][expected], atol=1e-6)
+    np.testing.assert_allclose(surface.normals[order], normals[towards][expected], atol=1e-5)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_furnished_room_corrects_perturbed_cameras(seed):
     seen, _ = surfaces(seed, bias_m=0.002)
