@@ -14,13 +14,13 @@ import numpy as np
 from intercap_core.geometry.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.projection import MIN_DEPTH_M
-from intercap_core.geometry.camera.projection_kernels import distort
+from intercap_core.geometry.camera.projection_kernels import distort, project_point
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.geometry.camera.transforms import apply
 
 Window = tuple[slice, slice]
 
 _HALF = np.float32(0.5)
+_GRID = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 5)]), -1).reshape(-1, 2)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
@@ -31,20 +31,16 @@ def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
     A grid of 5 x 5 points of the mask's box is placed at three depths and projected into the depth
     image.
     """
-    x, y, w, h = mask.box
-    if w == 0 or camera.depth is None or camera.colour_from_depth is None:
+    if mask.box[2] == 0 or camera.depth is None or camera.colour_from_depth is None:
         return None
-    corners = np.array([[x + i * w / 4, y + j * h / 4] for i in range(5) for j in range(5)])
-    rays = camera.colour.unproject(corners)
-    rays = rays[np.isfinite(rays).all(1)]
-    depth_from_colour = np.linalg.inv(camera.colour_from_depth)
-    depths = (0.7, 2.0, 6.0)  # metres, near and far ends of a room
-    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in depths])
-    pixels = camera.depth.project(placed)
+    rays = camera.colour.unproject(mask.box[:2] + _GRID * mask.box[2:])
+    low, high = _depth_range(
+        rays, camera.colour_from_depth, tuple(camera.depth.parameters.tolist())
+    )
     height, width = depth.shape
     margin = 6  # px of the depth image
-    x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
-    x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
+    x0, y0 = np.floor(low).astype(int) - margin
+    x1, y1 = np.ceil(high).astype(int) + margin
     rows = slice(max(int(y0), 0), min(int(y1), height))
     columns = slice(max(int(x0), 0), min(int(x1), width))
     return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
@@ -116,7 +112,7 @@ def _mask_pixels(
     Two passes over the window. The first projects each pixel that counts, and stores the smallest
     depth in each cell of a coarse grid of the colour image (``nearest``). The second returns the
     pixels that fall on the mask, except those that are ``hidden_m`` behind the smallest depth in
-    their own or a neighbouring cell.
+    their own or a neighbouring cell (``front``).
 
     Args:
         depth: (H, W) uint16 mm.
@@ -170,6 +166,7 @@ def _mask_pixels(
                 j = int(np.floor((u[r, c] + _HALF) / cell)) - left
                 if 0 <= i < bottom - top and 0 <= j < right - left:
                     nearest[i, j] = min(nearest[i, j], z[r, c])
+    front = _smallest_around(nearest)
     index = np.empty((-(-height // every)) * (-(-width // every)), np.int64)
     count = 0
     for r in range(0, height, every):
@@ -181,14 +178,46 @@ def _mask_pixels(
                 continue
             i = int(np.floor((v[r, c] + _HALF) / cell)) - top
             j = int(np.floor((u[r, c] + _HALF) / cell)) - left
-            front = z[r, c]
-            for k in range(max(i - 1, 0), min(i + 2, bottom - top)):
-                for m in range(max(j - 1, 0), min(j + 2, right - left)):
-                    front = min(front, nearest[k, m])
-            if not z[r, c] > front + hidden_m:
+            if not z[r, c] > front[i, j] + hidden_m:
                 index[count] = (rows[0] + r) * depth.shape[1] + columns[0] + c
                 count += 1
     return index[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _depth_range(rays, pose, lens):
+    """Return the smallest and largest column and row, (2,) each, of rays in the depth image.
+
+    ``rays`` (N, 3), colour frame, are cut at three depths; those that are not finite are skipped.
+    pose: (4, 4) colour_from_depth; lens: (13,) of the depth camera.
+    """
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for ray in rays:
+        if not np.isfinite(ray).all():
+            continue
+        for z in (0.7, 2.0, 6.0):  # metres, near and far ends of a room
+            x, y, z = (pose[:3, :3].T * (z * ray - pose[:3, 3])).sum(1)
+            for k, at in enumerate(project_point(x, y, z, lens)):
+                low[k], high[k] = min(low[k], at), max(high[k], at)
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True)
+def _smallest_around(values):
+    """Return the minimum (h, w) over the 3 x 3 neighbours of each of ``values`` (h, w)."""
+    height, width = values.shape
+    result = values.copy()
+    for i in range(height):
+        for j in range(1, width):
+            result[i, j] = min(result[i, j], values[i, j - 1])
+        for j in range(width - 1):
+            result[i, j] = min(result[i, j], values[i, j + 1])
+    along = result.copy()
+    for i in range(height):
+        for k in range(max(i - 1, 0), min(i + 2, height)):
+            for j in range(width):
+                result[i, j] = min(result[i, j], along[k, j])
+    return result
 
 
 @numba.njit(cache=True, nogil=True)
@@ -196,12 +225,13 @@ def decode_box(ends, box, height):
     """Return the mask within its box, (w, h) bool: axis 0 is the column. ends, box: of `Runs`."""
     mask = np.zeros((box[2], box[3]), np.bool_)
     for run in range(1, len(ends), 2):
-        column, row = ends[run - 1] // height, ends[run - 1] % height
-        for _ in range(ends[run] - ends[run - 1]):
-            mask[column - box[0], row - box[1]] = True
-            row += 1
-            if row == height:
-                column, row = column + 1, 0
+        start, end = ends[run - 1], ends[run]
+        while start < end:  # one column at a time
+            column, row = start // height, start % height
+            count = min(end - start, height - row)
+            first = row - box[1]
+            mask[column - box[0], first : first + count] = True
+            start += count
     return mask
 
 
