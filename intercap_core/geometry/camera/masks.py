@@ -106,13 +106,14 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
         raise ValueError("its counts are not a list of whole numbers")
     if lengths.size and lengths.min() < 0:
         raise ValueError(f"its counts hold {int(lengths.min())}, expected 0 or more")
-    filled = sum(int(n) for n in lengths)  # Python's integers do not overflow
+    runs = lengths.tolist()
+    filled = sum(runs)  # Python's integers do not overflow
     if filled != height * width:
         raise ValueError(
             f"its runs hold {filled} pixels, expected {height * width} "
             f"({width} x {height}, the colour image)"
         )
-    return _compress({"size": [height, width], "counts": [int(n) for n in lengths]}, height, width)
+    return _compress({"size": [height, width], "counts": runs}, height, width)
 
 
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:

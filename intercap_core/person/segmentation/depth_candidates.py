@@ -240,13 +240,13 @@ class DepthSegmenter:
         chosen = []
         touched = False
         for view in seen:
-            moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
-            parts = [moving]
+            mask = view.moving & (view.outside > NEAR_CUT)
+            moving = view.points[mask]
             for k, item in enumerate(self._static):
                 if not item.carries:
-                    parts.append(view.of_static[k])
-                    touched |= bool(item.cells.holds(view.points[moving]).any())
-            chosen.append(np.unique(np.concatenate(parts)))
+                    mask[view.of_static[k]] = True
+                    touched = touched or bool(item.cells.holds(moving).any())
+            chosen.append(np.flatnonzero(mask))
         if not touched:
             return []
         result = []

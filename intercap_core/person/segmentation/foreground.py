@@ -81,7 +81,12 @@ class DepthBackground:
     def shows(self, image: np.ndarray) -> np.ndarray:
         """Mask (H, W) of the pixels of an image (H, W), uint16 mm, that show the background."""
         away = cv2.absdiff(image, self.depth)
-        return (self.depth > 0) & (away <= _tolerance(self.depth))
+        return (self.depth > 0) & (away <= self._tolerance)
+
+    @cached_property
+    def _tolerance(self) -> np.ndarray:
+        """Tolerance (H, W) of :attr:`depth` in whole millimetres, rounded down."""
+        return _tolerance(self.depth).astype(np.uint16)
 
 
 def _tolerance(depth: np.ndarray) -> np.ndarray:

@@ -147,7 +147,8 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray, size: int
     foot point is the nearest point of the axis, and the radius is interpolated there, which
     slightly differs from the exact tapered capsule. A group of bones is skipped if its bounding
     ball, widened by the current minimum times the group's largest margin, does not contain the
-    point; this is exact. Square roots are only taken for bones that lower the minimum.
+    point; this is exact. The group that holds the previous point's nearest bone comes first, since
+    neighbouring points share it. Square roots are only taken for bones that lower the minimum.
 
     Args:
         points: (N, 3) float32.
@@ -156,10 +157,13 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray, size: int
         size: number of successive bones in a group.
     """
     result = np.empty(len(points), np.float32)
+    first = 0
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nearest = np.float32(FAR)
-        for g in range(len(balls)):
+        start = first
+        for k in range(len(balls)):
+            g = (start + k) % len(balls)
             ux, uy, uz = px - balls[g, 0], py - balls[g, 1], pz - balls[g, 2]
             reach = balls[g, 3] + max(nearest, np.float32(0)) * balls[g, 4]
             near = ux * ux + uy * uy + uz * uz < reach * reach
@@ -180,6 +184,7 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray, size: int
                 away = ux * ux + uy * uy + uz * uz
                 if reach > 0 and away < reach * reach:
                     nearest = (np.sqrt(away) - radius) / bones[b, 8]
+                    first = g
         result[i] = nearest
     return result
 

@@ -8,11 +8,9 @@ surface (a table) are separated from it by height. Components are computed on a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
+import numba
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
@@ -31,13 +29,13 @@ def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.nd
         return []
     occupied, inverse = np.unique(_keys(points, cell_m), return_inverse=True)
     label = _label_cells(occupied)
-    order = np.argsort(-np.bincount(label), kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    component = rank[label][inverse]  # (N,)
-    ends = np.cumsum(np.bincount(component))
-    members = np.split(np.argsort(component, kind="stable"), ends[:-1])
-    return [own for own in members if len(own) >= min_points]
+    component = label[inverse]  # (N,)
+    sizes = np.bincount(component)
+    ends = np.cumsum(sizes)
+    members = np.argsort(component, kind="stable")
+    largest_first = np.argsort(-np.bincount(label), kind="stable")
+    large = largest_first[sizes[largest_first] >= min_points]
+    return [members[ends[k] - sizes[k] : ends[k]] for k in large]
 
 
 class OccupiedCells:
@@ -69,19 +67,38 @@ def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
     return (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
 
 
+@numba.njit(cache=True)
 def _label_cells(keys: np.ndarray) -> np.ndarray:
     """Component (M,) of each cell, numbered in the order of first cells. ``keys``: (M,)
     ascending."""
-    around = [(x << 2 * _BITS) + (y << _BITS) + z for x, y, z in product((-1, 0, 1), repeat=3)]
-    cells, neighbours = [], []
-    for step in around[:13]:  # the 13 neighbours with smaller keys suffice: adjacency is symmetric
-        place = np.searchsorted(keys, keys + step)
-        hit = np.flatnonzero(keys[place] == keys + step)
-        cells.append(hit)
-        neighbours.append(place[hit])
-    edges = (np.concatenate(cells), np.concatenate(neighbours))
-    graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(len(keys), len(keys)))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    parent = np.arange(len(keys))  # a forest; the root of a component is its first cell
+    # the 13 neighbours with smaller keys suffice: adjacency is symmetric
+    for neighbour in range(13):
+        x, y, z = neighbour // 9 - 1, neighbour // 3 % 3 - 1, neighbour % 3 - 1
+        step = (x << 2 * _BITS) + (y << _BITS) + z
+        other = 0
+        for cell in range(len(keys)):
+            while keys[other] < keys[cell] + step:
+                other += 1
+            if keys[other] == keys[cell] + step:
+                one, two = _root(parent, cell), _root(parent, other)
+                parent[max(one, two)] = min(one, two)
+    label, count = np.empty_like(parent), 0
+    for cell in range(len(keys)):
+        if parent[cell] == cell:
+            label[cell], count = count, count + 1
+        else:
+            label[cell] = label[parent[cell]]
+    return label
+
+
+@numba.njit(cache=True)
+def _root(parent: np.ndarray, cell: int) -> int:
+    """Root of the tree of a cell; shortens the path to it."""
+    while parent[cell] != cell:
+        parent[cell] = parent[parent[cell]]
+        cell = parent[cell]
+    return cell
 
 
 @dataclass(frozen=True, eq=False)
