@@ -103,7 +103,7 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             name="detections",
-            purpose="Keypoints and segmentation candidates, from files or models.",
+            purpose="Keypoints and segmentation masks (candidates), from files or models.",
             reads=("frames",),
             columns=(
                 "layout", "recordings", "calibration", "calibration_scale", "keypoints",

@@ -59,10 +59,17 @@ def parse_entry(model: type[M], values: Any, where: str, what: str, faults: list
 
 def describe(error: ValidationError, model: type[BaseModel], where: str, what: str) -> list[str]:
     """One message for each fault that a model has found; arguments as of :func:`parse_entry`."""
-    messages = []
+    return [
+        f"{where}: {what} {field or '(the whole entry)'}: {text}"
+        for field, text in list_faults(error, model, what)
+    ]
+
+
+def list_faults(error: ValidationError, model: type[BaseModel], what: str) -> list[tuple[str, str]]:
+    """Field ("" for the whole entry) and message of each fault; arguments as of parse_entry."""
+    faults = []
     for fault in error.errors(include_url=False):
         parts = [str(part)[:80] for part in fault["loc"] if "[" not in str(part)]  # tags of unions
-        field = ".".join(parts) or "(the whole entry)"
         found = fault.get("input")
         shown = "" if isinstance(found, dict) else f", found {quoted(found)}"
         if fault["type"] == "missing":
@@ -73,8 +80,8 @@ def describe(error: ValidationError, model: type[BaseModel], where: str, what: s
             text = f"no such {what}{hint}; config/README.md lists them"
         else:
             text = f"{_expectation(fault)[:400]}{shown}; correct it"
-        messages.append(f"{where}: {printable(f'{what} {field}: {text}')}")
-    return messages
+        faults.append((printable(".".join(parts)), printable(text)))
+    return faults
 
 
 def _expectation(fault: ErrorDetails) -> str:

@@ -28,6 +28,7 @@ from intercap_core.annotation import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import parse_yaml, yaml_fault
 from intercap_core.inputs.files import MAX_TEXT_BYTES, read_bytes
+from intercap_core.validation import list_faults
 
 NO_FILE = "none"  # digest if there is no file
 _BOM = b"\xef\xbb\xbf"
@@ -155,11 +156,8 @@ def faults(sections: Mapping[str, Any]) -> list[dict[str, str]]:
         Annotation.model_validate(dict(sections))
     except ValidationError as error:
         return [
-            {
-                "where": ".".join(map(str, fault["loc"])) or "annotation",
-                "message": fault["msg"].removeprefix("Value error, "),
-            }
-            for fault in error.errors(include_url=False)
+            {"where": field or "annotation", "message": text}
+            for field, text in list_faults(error, Annotation, "entry")
         ]
     return []
 

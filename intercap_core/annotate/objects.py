@@ -23,6 +23,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.mesh_files import file_vertices, load_mesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project, tidy
+from intercap_core.validation import describe
 
 _CHANGED = "{}: was changed by another annotator; reload the page"
 
@@ -97,7 +98,10 @@ def save_symmetry(
     """
     try:
         SymmetryGroup.from_settings(Symmetry.model_validate(symmetry))
-    except (ValidationError, ValueError) as error:
+    except ValidationError as error:
+        fault = describe(error, Symmetry, f"object {entry.name!r}", "symmetry")[0]
+        raise UserError(fault) from None
+    except ValueError as error:
         fault = str(error).splitlines()[0][:200]
         raise UserError(f"object {entry.name!r}: symmetry is invalid ({fault})") from None
     objects = document.read(_file(project))

@@ -148,7 +148,7 @@ def docs(
     root: Annotated[Path, typer.Argument(help="The project's root.")] = Path("."),
     check_only: Annotated[bool, typer.Option("--check", help="Only list stale files.")] = False,
 ) -> None:
-    """Write the files that are generated from code: settings, schemas, pages on artefacts."""
+    """Write the files that are generated from code: settings, schemas, pages on result files."""
     from intercap_core.commands.docs import generate
 
     stale = generate(root, write=not check_only)

@@ -44,16 +44,16 @@ def doctor(
 
 @app.command()
 def inspect(
-    artefact: Annotated[Path, typer.Argument(help="An .h5 file that a stage wrote.")],
+    file: Annotated[Path, typer.Argument(help="A result file (.h5), which a stage wrote.")],
     verify: Annotated[bool, typer.Option(help="Read all data and check its checksums.")] = False,
 ) -> None:
-    """Print the contents of an artefact: attributes, datasets with shapes and units, flags.
+    """Print the contents of a result file: attributes, datasets with shapes and units, flags.
 
     Example: intercap inspect results/demo/cup_drink_s02/joint.h5
     """
     from intercap_core.commands.inspect import print_summary
 
-    print_summary(artefact, verify=verify)
+    print_summary(file, verify=verify)
 
 
 @app.command()

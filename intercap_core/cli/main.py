@@ -34,9 +34,9 @@ app = typer.Typer(
         "[cyan]intercap run lab/config.yaml[/cyan] computes everything that is missing or out of "
         "date.\n\n"
         "[bold]One stage:[/bold] [cyan]intercap stage joint config/demo/config.yaml "
-        "cup_drink_s02[/cyan] runs one stage on existing artefacts; "
+        "cup_drink_s02[/cyan] runs one stage on the results of earlier ones; "
         "[cyan]intercap inspect results/demo/cup_drink_s02/joint.h5[/cyan] prints the contents of "
-        "an artefact."
+        "a result file."
     ),
 )
 

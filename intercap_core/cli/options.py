@@ -78,7 +78,7 @@ def check_output(path: Path, *, replace_any: bool) -> None:
             artefacts.schema_name(path)
         except artefacts.Unreadable:
             raise UserError(
-                f"{path}: exists and is not an artefact, so it is not replaced; name another "
+                f"{path}: exists and is no result file, so it is not replaced; name another "
                 "output or delete it"
             ) from None
     try:

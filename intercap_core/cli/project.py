@@ -57,7 +57,7 @@ def init(
         Path | None, typer.Option(help="Keypoint files, a folder for each sequence.")
     ] = None,
     candidates: Annotated[
-        Path | None, typer.Option(help="Segmentations, a folder for each sequence.")
+        Path | None, typer.Option(help="Segmentation masks, a folder for each sequence.")
     ] = None,
     results: Annotated[
         Path | None,
@@ -71,9 +71,9 @@ def init(
 ) -> None:
     """Write settings and tables for the recordings in a folder, then check them.
 
-    Recognises layouts, cameras, calibrations, keypoints, candidates and meshes, and copies of
-    InterCap's and BEHAVE's releases. The folder itself is not changed. Entries that cannot be
-    recognised get a default and a comment that begins with FILL IN.
+    Recognises layouts, cameras, calibrations, keypoints, segmentation masks (candidates) and
+    meshes, and copies of InterCap's and BEHAVE's releases. The folder itself is not changed.
+    Entries that cannot be recognised get a default and a comment that begins with FILL IN.
 
     Examples: intercap init ~/recordings --output lab; intercap init ~/InterCap --output intercap;
     intercap init ~/BEHAVE --results ~/BEHAVE --dataset theirs --output theirs
@@ -115,6 +115,7 @@ def check(settings: SettingsOrDefault) -> None:
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.commands.check import check_project
+    from intercap_core.commands.console import counted
 
     start = time.monotonic()
     found = check_project(settings)
@@ -126,8 +127,8 @@ def check(settings: SettingsOrDefault) -> None:
     for fault in found.faults:
         typer.echo(f"problem: {fault}", err=True)
     if found.summaries:
-        count = len(found.summaries)
-        typer.echo(f"checked the recordings of {count} sequences in {elapsed:.1f} s")
+        count = counted(len(found.summaries), "sequence")
+        typer.echo(f"checked the recordings of {count} in {elapsed:.1f} s")
     typer.echo(f"{settings}: {found.ready} of {found.sequences} sequences are ready to run")
     if found.faults:
         raise typer.Exit(1)
@@ -217,9 +218,9 @@ def compare(
     """Print the differences between two versions of a dataset, by sequence and frame.
 
     Lists how far body, hands and object moved after the joint fit, which frames gained or lost
-    contact or a flag, the stated errors, and the figures of both versions. Copy the results before
-    you fix an annotation, and compare afterwards. You can also compare another program's results
-    for the same recordings (column results of sequences.tsv) with ours.
+    contact or a flag, the estimated errors, and the figures of both versions. Copy the results
+    before you fix an annotation, and compare afterwards. You can also compare another program's
+    results for the same recordings (column results of sequences.tsv) with ours.
 
     Example: intercap compare results/demo_before results/demo --output changes
     """

@@ -39,8 +39,8 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         typer.echo(run_step(stage, project, sequence, output=output))
 
     command.__doc__ = (
-        f"{purpose}\n\nReads the artefacts of earlier stages of this sequence. Its settings are "
-        f"the section `{stage}` of SETTINGS (config/README.md).\n\n"
+        f"{purpose}\n\nReads the result files (.h5) of earlier stages of this sequence. Its "
+        f"settings are the section `{stage}` of SETTINGS (config/README.md).\n\n"
         f"Example: intercap stage {stage.replace('_', '-')} config/demo/config.yaml cup_drink_s02"
     )
     return command

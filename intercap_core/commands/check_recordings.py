@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.commands.console import counted
 from intercap_core.config import DetectionsSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
@@ -33,6 +34,9 @@ from intercap_core.schemas import TRUTH
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
 FULL_LENGTH_SHARE = 0.95  # a shorter one is noted
 MIN_IMAGE_SHARE = 0.9  # smallest share of the expected images; recordings lose a few images
+_NAMES = {
+    "images": "images", "keypoints": "keypoints", "candidates": "segmentation masks (candidates)"
+}  # fmt: skip
 _IMAGE_IDS = [
     re.compile(rb'"%s"\s*:\s*("[^"]*"|[^,}\s]+)' % key) for key in (b"image_id", b"file_name")
 ]
@@ -107,7 +111,7 @@ class RecordingFindings:
                 self.add_recognised(kind, [f"images {remark}"])
         if not recorded or not count:
             return
-        cover = f"{folder}: {kind} of camera {images.name} cover {count}"
+        cover = f"{folder}: {_NAMES[kind]} of camera {images.name} cover {count}"
         if count < MIN_IMAGE_SHARE * recorded:
             self.notes.append(f"{cover} of its {recorded} images; run the detector on all of them")
         elif count * MIN_IMAGE_SHARE > recorded:
@@ -178,7 +182,7 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
     findings.notes += _notes_on_object(project, row, posed, findings)
     if findings.summary:
         recognised = [
-            f"{kind}: {', '.join(sorted(texts))}"
+            f"{_NAMES[kind]}: {', '.join(sorted(texts))}"
             for kind, texts in findings.recognised.items()
             if texts
         ]
@@ -300,7 +304,7 @@ def _notes_on_candidates(
                 findings.add_recognised("candidates", preview.recognised)
                 labels |= preview.labels
         elif settings.segmentation_model is None:
-            notes.append(f"{folder} has no {name}.json; add this camera's candidates")
+            notes.append(f"{folder} has no {name}.json; add this camera's {_NAMES['candidates']}")
     entry = project.object_of(row.sequence)
     expected = () if entry is None else entry.labels
     if labels and expected and not labels & {*expected}:
@@ -326,9 +330,9 @@ def _notes_on_object(
     ):
         return []
     return [
-        f"no camera has depth and there are no candidates of object {row.object!r}, so it will "
-        "probably not be found; run a segmentation model and add the column candidates, or record "
-        "with depth"
+        f"no camera has depth and there are no {_NAMES['candidates']} of object {row.object!r}, "
+        "so it will probably not be found; run a segmentation model and name its folder in the "
+        "column candidates, or record with depth"
     ]
 
 
@@ -504,7 +508,7 @@ def _summary(row: SequenceEntry, recordings: dict[str, CheckedRecording]) -> str
     seconds = [preview.seconds for preview in previews if preview.seconds is not None]
     depth = sum(recording.depth for recording in recordings.values())
     detected = [
-        f"{kind} of {count}"
+        f"{_NAMES[kind]} of {count}"
         for kind, has in (
             ("keypoints", lambda name, f: keypoint_files.has_keypoints(f, name)),
             ("candidates", lambda name, f: candidate_files.has_candidates(f, name, row.layout)),
@@ -513,9 +517,9 @@ def _summary(row: SequenceEntry, recordings: dict[str, CheckedRecording]) -> str
         and (count := sum(has(name, folder) for name in recordings))
     ]
     parts = [
-        f"{len(recordings)} cameras" if len(recordings) > 1 else "1 camera",
+        counted(len(recordings), "camera"),
         ", ".join(f"{width}x{height}" for width, height in sizes),
-        f"{_span(images, '{:d}')} images" if images else "",
+        f"{_span(images, '{:d}')} image{'s' * (max(images) != 1)}" if images else "",
         f"{_span(seconds, '{:.1f}')} s" if seconds else "",
         f"depth of {depth}" if depth else "no depth",
         *detected,

@@ -8,7 +8,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.console import ListTable, counted, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.compare import SAME, Comparison, compare
 
@@ -40,8 +40,8 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
     left = max(0, differs - ROWS)
     more = f" ({left} of them are not printed)" if left else ""
     print(
-        f"{differs} of {len(comparison.sequences)} sequences differ{more}, "
-        f"{len(comparison.frames)} frames; {same} are the same"
+        f"{differs} of {len(comparison.sequences)} sequences differ{more}, in "
+        f"{counted(len(comparison.frames), 'frame')}; {same} are the same"
     )
     if output is None:
         return []

@@ -15,6 +15,11 @@ UNLIMITED = 100_000  # columns of a console that is no terminal
 LAST_COLUMN = 24  # characters below which the last column is not wrapped
 
 
+def counted(count: int, noun: str) -> str:
+    """Return the number with the noun, which gets an s unless the number is 1."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def standard_console() -> Console:
     """Return the console of standard output; lines have any length if it is no terminal."""
     return Console(width=None if sys.stdout.isatty() else UNLIMITED)

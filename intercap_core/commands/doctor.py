@@ -103,9 +103,9 @@ def _disk(project: Project) -> Iterator[Finding]:
     yield Finding("disk", GOOD if enough else BAD, words)
     share = 100 * usage.per_output["frames"] / max(sum(usage.per_output.values()), 1)
     yield Finding(
-        "deletable", NOTE,
-        f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done; a later run writes it "
-        "again",
+        "disk", NOTE,
+        f"frames.h5 ({share:.0f} % of a sequence) can be deleted when a dataset is done; a later "
+        "run writes it again",
     )  # fmt: skip
 
 

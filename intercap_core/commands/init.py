@@ -81,7 +81,7 @@ def _refuse(sources: Sources, used: Sources, why: str) -> None:
 def print_draft(draft: Draft, root: Path) -> None:
     """Print what was recognised, one row for each sequence, and what a person has to fill in."""
     table = ListTable(
-        "sequence", "layout", "cameras", "calibration", "keypoints", "candidates", "object",
+        "sequence", "layout", "cameras", "calibration", "keypoints", "masks (candidates)", "object",
         "subject",
     )  # fmt: skip
     for row in draft.rows:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.console import ListTable, counted, standard_console
 from intercap_core.inputs.files import printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
@@ -24,6 +24,9 @@ WAITING = "waits"  # for an artefact that the stage reads and that is not done
 _MARKS = {
     DONE: "[green]✓[/green]", RUNNING: "[yellow]▶[/yellow]", FAILED: "[red]✗[/red]",
     STALE: "[yellow]≠[/yellow]", MISSING: "·", WAITING: "[dim]…[/dim]",
+}  # fmt: skip
+_LABELS = {state: state for state in _MARKS} | {
+    MISSING: "not computed yet", WAITING: "waits for an earlier stage"
 }  # fmt: skip
 
 
@@ -110,21 +113,22 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
     console = standard_console()
     states = {name: current.of(name) for name in current.sequences}
     counts = {state: list(states.values()).count(state) for state in _MARKS}
-    words = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    print(f"{project.config.dataset}: {words} of {len(states)} sequences")
+    words = ", ".join(f"{count} {_LABELS[state]}" for state, count in counts.items() if count)
+    print(f"{project.config.dataset}, {counted(len(states), 'sequence')}: {words}")
     shown = [name for name in states if every or states[name] != DONE]
     if shown:
         console.print(_table(current, shown[:ROWS] if not every else shown))
     if len(shown) > ROWS and not every:
         print(f"... and {len(shown) - ROWS} more; --all prints them")
     if shown:
-        marks = ", ".join(f"{mark} {state}" for state, mark in _MARKS.items())
+        marks = ", ".join(f"{mark} {_LABELS[state]}" for state, mark in _MARKS.items())
         console.print(f"[dim]{marks}[/dim]", highlight=False)
     for line in _reasons(current):
         print(line)
     if current.dataset.state != DONE:
         why = f": {'; '.join(current.dataset.words)}" if current.dataset.words else ""
-        print(f"the site's first page, tables and card are {current.dataset.state}{why}")
+        label = _LABELS[current.dataset.state]
+        print(f"the site's first page, tables and card are {label}{why}")
     for machine, count in _other_machines(current).items():
         print(
             f"{count} results were computed on another machine or device ({machine}); they may "
@@ -195,5 +199,6 @@ def print_verification(project: Project) -> bool:
     faults = [words for by_stage in by_sequence for words in by_stage.values()]
     for words in faults:
         print(printable(words))
-    print(f"{len(project.sequences)} sequences read, {len(faults)} outputs damaged or missing")
+    read, wrong = counted(len(project.sequences), "sequence"), counted(len(faults), "output")
+    print(f"{read} read, {wrong} damaged or missing")
     return not faults

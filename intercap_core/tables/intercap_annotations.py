@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.inputs.documents import dump_yaml, parse_integer
 from intercap_core.inputs.files import UnreadableFile, read_text
+from intercap_core.validation import list_faults
 
 FOLDER = re.compile(
     r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
@@ -68,10 +69,9 @@ def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
     try:
         Annotation.model_validate(sections)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        section = str(first["loc"][0])
-        faults.append(f"{section}: {first['msg']}")
-        sections.pop(section, None)
+        field, text = list_faults(error, Annotation, "entry")[0]
+        faults.append(f"{field}: {text}")
+        sections.pop(field.partition(".")[0], None)
     if not sections:
         return Converted("", faults)
     head = f"# From {folder.name} of the release. Frames are frame sets, from 0.\n"

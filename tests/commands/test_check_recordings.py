@@ -121,7 +121,7 @@ def few_candidates(folder: Path) -> None:
         (emptied, "", "left 1 of 40 colour files are empty (first: 00003.jpg)"),
         (all_cut, "left has no image that can be read, expected 96x64", "files are damaged"),
         (few_keypoints, "", "keypoints of camera left cover 4 of its 40 images; run the"),
-        (few_candidates, "", "candidates of camera left cover 2 of its 40 images; run the"),
+        (few_candidates, "", "masks (candidates) of camera left cover 2 of its 40 images; run the"),
     ],
 )  # fmt: skip
 def test_a_faulty_folder_of_images_is_reported(
@@ -138,7 +138,8 @@ def test_a_faulty_folder_of_images_is_reported(
 
 def test_summary_of_a_good_sequence(images: SequenceEntry) -> None:
     assert look(images).summary == (
-        "2 cameras; 96x64; 40 images; 3.9 s; no depth; keypoints of 2; candidates of 2"
+        "2 cameras; 96x64; 40 images; 3.9 s; no depth; keypoints of 2; "
+        "segmentation masks (candidates) of 2"
     )
 
 

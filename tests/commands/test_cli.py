@@ -149,7 +149,7 @@ def test_stages_read_only_earlier_stages() -> None:
             "sequence 'nobody' is not in the table",
         ),
         (("dev", "studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
-        ((*SCENE, "--output", "README.md"), "README.md: exists and is not an artefact"),
+        ((*SCENE, "--output", "README.md"), "README.md: exists and is no result file"),
         ((*SCENE, "--output", "docs"), "docs: is a folder, expected a file"),
         ((*SCENE, "--output", "README.md/a.h5"), "README.md/a.h5: cannot be written ("),
         ((*SCENE, "--output", "/proc/a.h5"), "/proc/a.h5: cannot be written ("),
@@ -547,7 +547,7 @@ def test_status_is_printed_on_terminals_of_any_encoding(inside: Path) -> None:
     output = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
     Path("config.yaml").write_text("dataset: trial\nexclude: [bad, empty]\n")
     assert intercap("status", "config.yaml", folder=inside, output=output).returncode == 0
-    assert "trial: 1 missing of 1 sequences" in output.buffer.getvalue().decode("latin-1")
+    assert "trial, 1 sequence: 1 not computed yet" in output.buffer.getvalue().decode("latin-1")
 
 
 def test_reasons_with_markup_are_printed_literally(inside: Path) -> None:

@@ -123,7 +123,7 @@ def test_tables_are_written_and_printed(
         file["joints"][1] += 0.1
     written = print_comparison(*versions, tmp_path / "changes")
     printed = capsys.readouterr().out
-    assert "3 of 4 sequences differ, 1 frames; 1 are the same" in " ".join(printed.split())
+    assert "3 of 4 sequences differ, in 1 frame; 1 are the same" in " ".join(printed.split())
     assert [path.name for path in written] == [
         "compare_sequences.csv", "compare_frames.csv", "compare_figures.csv"
     ]  # fmt: skip

@@ -217,7 +217,7 @@ def test_another_processor_is_reported_and_reruns_nothing(
     assert _pending() == set()
     print_status(project)
     printed = capsys.readouterr().out
-    assert "2 done of 2 sequences" in printed
+    assert "2 sequences: 2 done" in printed
     assert "1 results were computed on another machine or device (cuda, another)" in printed
 
 

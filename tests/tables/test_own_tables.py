@@ -178,7 +178,10 @@ def test_an_object_that_nothing_shows_is_noted(folder: Path) -> None:
     assert "will probably not be found" not in init()[0]
     shutil.rmtree(folder / "candidates")
     output, _ = init("--replace")
-    assert "no camera has depth and there are no candidates of object 'cup'" in output
+    assert (
+        "no camera has depth and there are no segmentation masks (candidates) of object 'cup'"
+        in output
+    )
 
 
 def test_a_missing_calibration_is_marked(folder: Path) -> None:
