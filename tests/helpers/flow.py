@@ -125,9 +125,13 @@ class Flow:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Environment in which the copy's own package runs."""
-        kernels = str(self.folder / "kernels")
-        return {**os.environ, "PYTHONPATH": str(self.folder), "NUMBA_CACHE_DIR": kernels}
+        """Environment in which the copy's own package runs; its modules are compiled once."""
+        return {
+            **os.environ,
+            "PYTHONPATH": str(self.folder),
+            "NUMBA_CACHE_DIR": str(self.folder / "kernels"),
+            "PYTHONDONTWRITEBYTECODE": "",
+        }
 
     @property
     def results(self) -> Path:

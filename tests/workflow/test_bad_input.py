@@ -55,7 +55,7 @@ def test_a_wrong_table_stops_before_any_job(lab: Flow) -> None:
     path = lab.folder / "config" / "lab" / "sequences.tsv"
     path.write_text(path.read_text().replace("\tcup\t", "\tmug\t"))
     before = computed(lab, ONE)
-    done = lab.run()
+    done = lab.ask()
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "config/lab/sequences.tsv" in line]
@@ -69,7 +69,7 @@ def test_an_invalid_annotation_keeps_the_results(lab: Flow) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_text("contact: [{part: seat, start: 4, end: 99}]\n")
     before = computed(lab, ONE)
-    done = lab.run(str(lab.artefact(ONE, "metrics").relative_to(lab.folder)))
+    done = lab.ask(str(lab.artefact(ONE, "metrics").relative_to(lab.folder)))
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith(f"{ONE}: annotation"))

@@ -51,7 +51,7 @@ def test_several_targets_are_remade_after_an_edit(flow: Flow) -> None:
         str(flow.artefact(ONE, stage).relative_to(flow.folder)) for stage in ("joint", "summary")
     ]
     with edited(flow.annotation(ONE), CONTACT):
-        done = flow.run("--dry-run", *targets)
+        done = flow.ask("--dry-run", *targets)
     assert done.returncode == 0, done.stderr[-3000:]
     jobs = re.findall(r"^(\w+) +1$", done.stdout + done.stderr, re.MULTILINE)
     assert set(jobs) == {"joint", "metrics", "summary"}
