@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from intercap_core.commands.evaluate.constants import count_constants
-from intercap_core.commands.evaluate.detector import grip_slips, rig_errors, statement
-from intercap_core.commands.evaluate.run import evaluate
-from intercap_core.errors import UserError
-from intercap_core.evaluation.verdict.figures import StatedError
-from intercap_core.project import load_project
-from intercap_core.studio.mediapipe import VARIABLE
-
-NAMES = ("config", "measured")
+from intercap_core.commands.evaluate.detector import grip_slips, rig_errors
 
 
 def test_a_grip_slips_by_what_its_error_changes() -> None:
@@ -34,32 +24,6 @@ def test_short_touches_are_no_grips() -> None:
     holding = np.zeros((20, 2), bool)
     holding[3:7, 1] = True  # 0.27 s
     assert grip_slips(wrists, np.zeros_like(wrists), holding, 15.0) == []
-
-
-def test_without_mediapipe_the_part_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "none"))
-    with pytest.raises(UserError, match="make mediapipe"):
-        evaluate({"detector": []}, tmp_path / "out.json")
-    assert not (tmp_path / "out.json").exists()
-
-
-def test_a_statement_marks_true_errors_outside_its_range() -> None:
-    assert statement(StatedError("s", "body", 8.0, 1.5, 12.0)) == "12.0: 8.0 (5.3 to 12.0)"
-    assert statement(StatedError("s", "body", 8.0, 1.5, 12.1)) == "12.1*: 8.0 (5.3 to 12.0)"
-    assert statement(StatedError("s", "body", 8.0, 1.5, float("nan"))) == ": 8.0 (5.3 to 12.0)"
-    assert statement(StatedError("s", "hands", float("nan"), 1.0, 30.0)) == "30.0: none stated"
-
-
-def test_the_twins_differ_in_their_keypoints_only() -> None:
-    real, simulated = (load_project(Path(f"config/detector/{n}.yaml")) for n in NAMES)
-    assert real.config.studio is not None and simulated.config.studio is None
-    assert real.sequences.keys() == simulated.sequences.keys()
-    for name, row in simulated.sequences.items():
-        same = real.sequences[name]
-        assert row.keypoints != same.keypoints
-        assert row.model_copy(update={"keypoints": same.keypoints}) == same
 
 
 def test_cameras_are_compared_by_name_and_relative_to_the_master() -> None:
@@ -84,10 +48,3 @@ def test_cameras_are_compared_by_name_and_relative_to_the_master() -> None:
     assert rig.pose_mm.rms() == pytest.approx((4.0, 2.0 * np.sqrt(3)))
     assert rig.offset_ms.rms() == pytest.approx((3.0, 1.0))
     assert rig.depth_bias_mm.rms() == pytest.approx((2.0, 3.0))
-
-
-def test_constants_are_names_in_capitals_with_numbers() -> None:
-    text = (
-        "# measured, in metres\nA, B = 1, 2.5\nC = 'text'\nlower = 3\nD: tuple = (1, 2)  # tuned\n"
-    )
-    assert count_constants(text) == {"constants": 3, "source": 2, "tuned": 1}

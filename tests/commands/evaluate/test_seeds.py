@@ -42,12 +42,6 @@ def test_only_seeds_and_people_change(here: Path) -> None:
     assert new.config.object_track == old.config.object_track and new.config.dataset == "object"
 
 
-def test_the_same_seed_gives_the_same_settings(here: Path) -> None:
-    first = drawn(here, "noise_2.yaml", 5)
-    text = first.path.read_bytes()
-    assert drawn(here, "noise_2.yaml", 5).path.read_bytes() == text
-
-
 def test_shared_recordings_stay_shared(here: Path) -> None:
     """Those without a detector are those of config.yaml."""
     shared, own = drawn(here, "no_detector.yaml", 5), drawn(here, "config.yaml", 5)
