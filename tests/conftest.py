@@ -23,9 +23,9 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 # Folders whose tests share a long run: all their tests stay on one worker.
 TOGETHER = ("workflow", "slurm")
-# Folders in the order in which they start; the others follow. The first ones compile most kernels,
-# which the processes of the next would compile again.
-FIRST = ("body_fit", "joint", *TOGETHER)
+# Folders in the order in which they start; the others follow. The workflow takes longest. Meanwhile
+# the other worker compiles the kernels of the fits, which the last stages of the workflow then use.
+FIRST = ("workflow", "body_fit", "joint", "slurm")
 # Not in `make test-fast`: folders and files that start processes, render captures or fit sequences,
 # and files that take more than some 3 s (`--durations`, warm kernels).
 SLOW = (
@@ -65,7 +65,6 @@ SLOW = (
     "scene/test_registration.py",
     "scene/test_slips.py",
     "scene/test_start_times.py",
-    "scene/test_studio_timing.py",
     "slurm",
     "stages",
     "studio/test_capture.py",
