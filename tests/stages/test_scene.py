@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,17 +37,17 @@ def run(paths: dict[str, Path], **changes) -> None:
     scene.run(**paths, **({"settings": SceneSettings(), "floor": None} | changes))
 
 
-def depths_of(rng: np.random.Generator, boxes=FURNITURE, walls: float | None = 3.6) -> list:
-    """Noisy depth images (T, H, W) of each camera."""
-    clean = [room_depth(camera, UP, boxes, walls) for camera in TRUTH]
+@cache
+def depth_images() -> list[np.ndarray]:
+    """Noisy depth images (T, H, W) of each camera; tests only read them."""
+    rng = np.random.default_rng(0)
+    clean = [room_depth(camera, UP, FURNITURE) for camera in TRUTH]
     return [np.stack([to_millimetres(depth, rng) for _ in range(T)]) for depth in clean]
 
 
-def capture(tmp_path: Path, rig: Rig, *room) -> dict[str, Path]:
-    rng = np.random.default_rng(0)
-    depths = depths_of(rng, *room)
+def capture(tmp_path: Path, rig: Rig, depths: list[np.ndarray] | None = None) -> dict[str, Path]:
     body = seen_by(walking(T, np.array([-0.3, -0.2]), np.array([0.1, 0.08]), 0.1), TRUTH, UP)
-    body[..., :2] += rng.normal(0, 3, body[..., :2].shape)
+    body[..., :2] += np.random.default_rng(2).normal(0, 3, body[..., :2].shape)
     people = [[[body[t, c]] for c in range(len(TRUTH))] for t in range(T)]
     return {
         "frames": write_frames(tmp_path / "frames.h5", rig, num_sets=T, depths=depths),
@@ -57,7 +58,7 @@ def capture(tmp_path: Path, rig: Rig, *room) -> dict[str, Path]:
 
 def test_cameras_floor_and_background_of_a_furnished_room(tmp_path):
     start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
-    paths = capture(tmp_path, start)
+    paths = capture(tmp_path, start, depth_images())
     run(paths)
     rig = Rig.from_scene(paths["output"])
     assert extrinsics_error(rig, TRUTH, MIDDLE)[1:].mean() < 0.006
@@ -84,7 +85,7 @@ def test_correct_pose_is_kept_while_others_are_refined(tmp_path, monkeypatch):
     poses = start.master_from_colour.copy()
     poses[3] = TRUTH.master_from_colour[3]
     start = start.moved(poses)
-    run(capture(tmp_path, start))
+    run(capture(tmp_path, start, depth_images()))
     with artefacts.read(tmp_path / "scene.h5", SCENE) as found:
         assert found["camera_refined"].tolist() == [False, True, True, False, True, True]
         np.testing.assert_array_equal(found["master_from_colour"][3], poses[3])
@@ -98,7 +99,7 @@ def test_correct_pose_is_kept_while_others_are_refined(tmp_path, monkeypatch):
 
 def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
     start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
-    paths = capture(tmp_path, start)
+    paths = capture(tmp_path, start, depth_images())
     floor = apply(invert(UP), np.array([[0, 0, 0.005], [1, 0, 0.005], [0, 1, 0.005]]))
     settings = SceneSettings(refine_extrinsics=False)
     run(paths, settings=settings, floor=[tuple(p) for p in floor])
@@ -115,7 +116,6 @@ def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
 
 def test_without_depth_the_start_stays_and_feet_show_the_floor(tmp_path):
     paths = capture(tmp_path, TRUTH)
-    write_frames(paths["frames"], TRUTH, num_sets=T)
     run(paths)
     with artefacts.read(paths["output"], SCENE) as found:
         assert found.attributes["ground_source"] == "feet" and found.keys("cameras/") == []
@@ -153,8 +153,7 @@ def test_stated_floor_is_used_unless_feet_contradict_it(tmp_path):
 
 def test_measured_floor_is_kept_and_compared_with_the_stated_one(tmp_path):
     paths = capture(tmp_path, TRUTH)
-    depths = depths_of(np.random.default_rng(0))
-    raised = ground_of(paths, depths, **STATED | {"stated_floor": ORIGIN + 0.2 * UP[2, :3]})
+    raised = ground_of(paths, depth_images(), **STATED | {"stated_floor": ORIGIN + 0.2 * UP[2, :3]})
     assert raised["ground_source"] == "fitted" and abs(raised["height"]) < 0.005
     assert raised["ground_note"] == "the floor is 0.20 m below the stated one"
 
@@ -180,7 +179,6 @@ def test_missing_images_and_collinear_floors_are_rejected(tmp_path):
 @pytest.mark.parametrize("with_people", [True, False])
 def test_rig_without_overlap_is_reported_and_not_degraded(tmp_path, with_people):
     start = perturbed(TRUTH, np.random.default_rng(5), 0.01, 0.3)
-    paths = capture(tmp_path, start, np.zeros((0, 2, 3)), None)
     rng, depths = np.random.default_rng(1), []
     for c, camera in enumerate(TRUTH):
         depth = room_depth(camera, UP, np.zeros((0, 2, 3)), None)
@@ -189,7 +187,7 @@ def test_rig_without_overlap_is_reported_and_not_degraded(tmp_path, with_people)
         sector = np.arctan2(world[..., 1], world[..., 0]) - 2 * np.pi * c / 6
         depth[np.abs((sector + np.pi) % (2 * np.pi) - np.pi) > np.radians(20)] = 0
         depths.append(np.stack([to_millimetres(depth, rng) for _ in range(T)]))
-    write_frames(paths["frames"], start, num_sets=T, depths=depths)
+    paths = capture(tmp_path, start, depths)
     if not with_people:
         nobody = [[[] for _ in TRUTH] for _ in range(T)]
         write_detections(paths["detections"], TRUTH, nobody)

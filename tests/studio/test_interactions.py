@@ -55,8 +55,6 @@ UMBRELLA = {"on_floor": False, "object_m_s": 6.5}
 CASES = {
     "suitcase_carry": Case("s01", 11, {"right_hand"}, (17, 36), CARRIED),
     "cup_drink": Case("s02", 12, DRUNK, (17, 36), CARRIED, on_floor=False),
-    "bottle_check": Case("s01", 8, PALMS, (16, 37), CHECKED, on_floor=False),
-    "football_pass": Case("s08", 24, PALMS, (16, 37), PASSED, on_floor=False),
     "racquet_glide": Case("s03", 6, {"right_hand"}, (16, 37), SWUNG, **RACQUET),
     "stool_sit": Case(
         "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
@@ -66,8 +64,10 @@ CASES = {
         "s01", 11, {"left_foot", "right_foot"}, (12, 33), ((0.0, 0.80), (2.17, 3.0))
     ),
 }  # fmt: skip
-# Scripts that share their motion with one above: second tier
+# Second tier
 MORE_CASES = {
+    "bottle_check": Case("s01", 8, PALMS, (16, 37), CHECKED, on_floor=False),
+    "football_pass": Case("s08", 24, PALMS, (16, 37), PASSED, on_floor=False),
     "bottle_drink": Case("s03", 5, DRUNK, (17, 36), CARRIED, on_floor=False),
     "football_check": Case("s04", 21, PALMS, (16, 37), CHECKED, on_floor=False),
     "cup_pass": Case("s10", 23, {"right_hand"}, (16, 37), PASSED, on_floor=False),
@@ -295,7 +295,14 @@ class Held:
         return slip_speed(fitted, self.local, self.touching, normals_at, FPS)
 
 
-@pytest.fixture(scope="module", params=["racquet_glide", "umbrella_turn", "bottle_regrasp"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        "racquet_glide",
+        pytest.param("umbrella_turn", marks=pytest.mark.full),
+        "bottle_regrasp",
+    ],
+)
 def held(request: pytest.FixtureRequest) -> Held:
     case = (CASES | MORE_CASES)[request.param]
     stage = make_stage(request.param, case.subject, case.seed)
