@@ -125,67 +125,44 @@ def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
     """Signed distance (N,) float32 of points (N, 3) float32 from the person, in margins.
 
-    Negative inside, at most ``FAR``. ``bones``: (B, 9), see :func:`build_bones`.
+    Negative inside, at most ``FAR``. The distance from a bone is (distance from its axis - radius
+    at the foot point) / margin. The foot point is the nearest point of the axis, and the radius is
+    interpolated there, which slightly differs from the exact tapered capsule.
+
+    ``bones``: (B, 9), see :func:`build_bones`.
     """
-    size = 5  # bones in a group; affects the speed only
-    groups = range(0, len(bones), size)
-    balls = np.zeros((len(groups), 5), np.float32)  # bounding balls of groups, largest margin
-    for row, first in zip(balls, groups, strict=True):
-        some = bones[first : first + size]
-        ends = some[:, :6].reshape(-1, 3)
-        row[:3] = (ends.min(0) + ends.max(0)) / 2
-        row[3] = np.linalg.norm(ends - row[:3], axis=1).max() + some[:, 6:8].max()
-        row[4] = some[:, 8].max()
-    return _outside(points, bones, balls, size)
+    along = bones[:, 3:6] - bones[:, :3]
+    length = np.maximum((along**2).sum(1, keepdims=True), np.float32(1e-10))
+    parts = [
+        bones[:, :3],
+        along,
+        along / length,
+        bones[:, 6:7],
+        np.diff(bones[:, 6:8]),
+        bones[:, 8:],
+    ]
+    return _outside(np.ascontiguousarray(points.T), np.concatenate(parts, 1))
 
 
 @numba.njit(cache=True, fastmath=True)
-def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray, size: int) -> np.ndarray:
-    """Kernel of :func:`distance_outside`: for each point, the minimum over all bones.
-
-    The distance from a bone is (distance from its axis - radius at the foot point) / margin. The
-    foot point is the nearest point of the axis, and the radius is interpolated there, which
-    slightly differs from the exact tapered capsule. A group of bones is skipped if its bounding
-    ball, widened by the current minimum times the group's largest margin, does not contain the
-    point; this is exact. The group that holds the previous point's nearest bone comes first, since
-    neighbouring points share it. Square roots are only taken for bones that lower the minimum.
+def _outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
+    """Kernel of :func:`distance_outside`, without branches so that the inner loop is vectorised.
 
     Args:
-        points: (N, 3) float32.
-        bones: (B, 9), see :func:`build_bones`.
-        balls: (G, 5) centre, radius and largest margin of each group.
-        size: number of successive bones in a group.
+        points: (3, N) float32.
+        bones: (B, 12) float32: start; vector to the end; the same divided by its squared length;
+            radius at the start; its change towards the end; margin.
     """
-    result = np.empty(len(points), np.float32)
-    first = 0
-    for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        nearest = np.float32(FAR)
-        start = first
-        for k in range(len(balls)):
-            g = (start + k) % len(balls)
-            ux, uy, uz = px - balls[g, 0], py - balls[g, 1], pz - balls[g, 2]
-            reach = balls[g, 3] + max(nearest, np.float32(0)) * balls[g, 4]
-            near = ux * ux + uy * uy + uz * uz < reach * reach
-            if not near:
-                continue
-            for b in range(g * size, min((g + 1) * size, len(bones))):
-                ax, ay, az = bones[b, 0], bones[b, 1], bones[b, 2]
-                dx, dy, dz = bones[b, 3] - ax, bones[b, 4] - ay, bones[b, 5] - az
-                ux, uy, uz = px - ax, py - ay, pz - az
-                length = dx * dx + dy * dy + dz * dz
-                share = np.float32(0)
-                if length > 1e-10:
-                    share = (ux * dx + uy * dy + uz * dz) / length
-                    share = min(max(share, np.float32(0)), np.float32(1))
-                ux, uy, uz = ux - share * dx, uy - share * dy, uz - share * dz
-                radius = bones[b, 6] + share * (bones[b, 7] - bones[b, 6])
-                reach = radius + nearest * bones[b, 8]
-                away = ux * ux + uy * uy + uz * uz
-                if reach > 0 and away < reach * reach:
-                    nearest = (np.sqrt(away) - radius) / bones[b, 8]
-                    first = g
-        result[i] = nearest
+    x, y, z = points[0], points[1], points[2]
+    result = np.full(len(x), np.float32(FAR))
+    for b in range(len(bones)):
+        ax, ay, az, dx, dy, dz, ex, ey, ez, radius, change, margin = bones[b]
+        for i in range(len(x)):
+            ux, uy, uz = x[i] - ax, y[i] - ay, z[i] - az
+            share = min(max(ux * ex + uy * ey + uz * ez, np.float32(0)), np.float32(1))
+            ux, uy, uz = ux - share * dx, uy - share * dy, uz - share * dz
+            away = np.sqrt(ux * ux + uy * uy + uz * uz)
+            result[i] = min(result[i], (away - radius - share * change) / margin)
     return result
 
 
