@@ -99,7 +99,7 @@ class Schema:
 
 def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
     if declared.codec == "depth":
-        return dict(hdf5plugin.Blosc2(cname="zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE))
+        return dict(hdf5plugin.Blosc2(cname="lz4", clevel=9, filters=hdf5plugin.Blosc2.BITSHUFFLE))
     if declared.codec == "gzip":
         return {"compression": "gzip", "compression_opts": 1, "shuffle": dtype.itemsize > 1}
     return {}
