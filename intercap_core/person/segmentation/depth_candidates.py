@@ -32,6 +32,7 @@ from intercap_core.person.segmentation.candidate_masks import (
 from intercap_core.person.segmentation.foreground import (
     DepthBackground,
     DepthView,
+    in_box,
     sampled_images,
     without_free_space,
     without_person_traces,
@@ -190,8 +191,8 @@ class DepthSegmenter:
         view, background = self._views[c], self._background[c]
         index = background.before(image)
         points, local = view.points(image, index)
-        inside = ((points > self._low) & (points < self._high)).all(1)
-        points, local, index = points[inside], local[inside], index[inside]
+        inside = np.flatnonzero(in_box(points, self._low, self._high))
+        points, local, index = (values.take(inside, 0) for values in (points, local, index))
         bones = self._person.bones(t, c)
         away = distance_outside(points, bones)
         # foreground only because this view's background is unknown there: if another view measures

@@ -133,8 +133,8 @@ class DepthView:
             image: (H, W) uint16 mm.
             index: (N,) flat pixel indices.
         """
-        z = image.ravel()[index] * np.float32(1e-3) - np.float32(self.bias_m)
-        local = self._rays[index] * z[:, None]
+        z = image.take(index) * np.float32(1e-3) - np.float32(self.bias_m)
+        local = self._rays.take(index, 0) * z[:, None]
         return local @ self._rotation.T + self.target_from_depth[:3, 3].astype(np.float32), local
 
     def reach_mm(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -169,6 +169,12 @@ class DepthView:
         return np.concatenate([rays, np.ones((len(rays), 1), np.float32)], 1)
 
 
+def in_box(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Mask (N,) of points (N, 3) between the corners ``low`` and ``high`` (3,) of a box."""
+    x, y, z = ((points > low) & (points < high)).T  # a reduction of rows of three is slower
+    return x & y & z
+
+
 def without_free_space(
     views: list[DepthView], backgrounds: list[DepthBackground], low: np.ndarray, high: np.ndarray
 ) -> list[DepthBackground]:
@@ -183,7 +189,7 @@ def without_free_space(
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
         index = np.flatnonzero(background.depth)
         points, _ = view.points(background.depth, index)
-        inside = ((points > low) & (points < high)).all(1)
+        inside = in_box(points, low, high)
         index, points = index[inside], points[inside]
         gone: np.ndarray = np.zeros(background.depth.shape, np.uint8)
         for other, far in enumerate(nearest):

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
+from intercap_core.person.segmentation.foreground import DepthBackground, DepthView, in_box
 
 CELL_M = 0.02  # side of the cells of a surface; a Kinect's points 4 m away are 8 mm apart
 _BITS = 21  # bits of each coordinate in a cell's integer key
@@ -141,7 +141,7 @@ def find_static_objects(
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
         flat = np.flatnonzero(background.depth)
         points, _ = view.points(background.depth, flat)
-        inside = ((points > low) & (points < high)).all(1)
+        inside = in_box(points, low, high)
         parts.append(points[inside])
         index.append(flat[inside])
         owner.append(np.full(int(inside.sum()), number, np.int32))
