@@ -19,13 +19,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.scene.surfaces import DepthSurface
+from intercap_core.scene.surfaces import DepthSurface, NearestPoints
 
 # Smallest standard deviation assumed for point-to-plane residuals; tuned on the studio.
 SURFACE_SIGMA_FLOOR_M = 0.003
@@ -124,15 +123,14 @@ class RigSolution:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Surfaces of one kind of one camera at all moments, with a search tree."""
+    """Surfaces of one kind of one camera at all moments, with a search structure."""
 
     surface: DepthSurface
     """All N points."""
-    tree: cKDTree
-    """Search tree over (N, 4): points and 10 m times the index of the moment, so that points of
-    different moments are never matched."""
+    nearest: NearestPoints
+    """Search among the points; its layers are the moments."""
     queries: tuple[DepthSurface, np.ndarray]
-    """Points that are matched for the fit, and their fourth coordinates in the search tree."""
+    """Points that are matched for the fit, and their moments."""
     held_out: tuple[DepthSurface, np.ndarray]
     """The same for points that are matched for evaluation only."""
 
@@ -142,18 +140,17 @@ class _Seen:
 
         A random quarter of the points is held out. At most 2500 points are matched for the fit and
         625 are held out, which bounds the run time. Both stay in the order of the surface, because
-        successive queries of the search tree are faster for neighbouring points.
+        successive searches are faster for neighbouring points.
         """
         surface = DepthSurface.joined([surface for _, surface in surfaces])
-        # 10 m: beyond any search radius
-        moment = np.repeat([10.0 * at for at, _ in surfaces], [len(s) for _, s in surfaces])
-        tree = cKDTree(np.column_stack([surface.points, moment]), balanced_tree=False)
+        moment = np.repeat([at for at, _ in surfaces], [len(s) for _, s in surfaces])
+        nearest = NearestPoints(surface.points, moment, SURFACE_SEARCH_M)
         order = np.random.default_rng(0).permutation(len(surface))
         queries, held_out = (
             (surface.subset(rows), moment[rows])
             for rows in (np.sort(np.delete(order, np.s_[::4])[:2500]), np.sort(order[::4][:625]))
         )
-        return cls(surface, tree, queries, held_out)
+        return cls(surface, nearest, queries, held_out)
 
 
 @dataclass(frozen=True)
@@ -299,12 +296,11 @@ class Registration:
         own, other = self._seen[kind][a], self._seen[kind][b]
         (queries, moment), surface = own.held_out if held_out else own.queries, other.surface
         points = apply(source, queries.points - at.bias[a] * queries.rays)
-        # the tree holds b's points with their depth bias, so the query points get the same bias
+        # b's points are searched with their depth bias, so the query points get the same bias
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
-        sought = np.column_stack([in_target * (1 + at.bias[b] / depth), moment])
-        distance, nearest = other.tree.query(sought, distance_upper_bound=SURFACE_SEARCH_M)
-        hit = np.flatnonzero(np.isfinite(distance))
+        nearest = other.nearest.query(in_target * (1 + at.bias[b] / depth), moment)
+        hit = np.flatnonzero(nearest >= 0)
         nearest, points = nearest[hit], points[hit]
         normals = surface.normals[nearest] @ target[:3, :3].T
         own_normals = queries.normals[hit] @ source[:3, :3].T

@@ -25,7 +25,12 @@ from intercap_core.scene.registration import (
     balance_directions,
 )
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surfaces import DepthSurface, moving_surfaces, surface_from_depth
+from intercap_core.scene.surfaces import (
+    DepthSurface,
+    NearestPoints,
+    moving_surfaces,
+    surface_from_depth,
+)
 from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import (
     FURNITURE,
@@ -117,6 +122,20 @@ def test_normals_are_cross_products_of_central_differences():
     order, expected = np.lexsort(surface.points.T), np.lexsort(points[towards].T)
     np.testing.assert_allclose(surface.points[order], points[towards][expected], atol=1e-6)
     np.testing.assert_allclose(surface.normals[order], normals[towards][expected], atol=1e-5)
+
+
+def test_nearest_points_are_those_of_all_pairs():
+    rng = np.random.default_rng(0)
+    points, sought = rng.uniform(-1, 1, (400, 3)), rng.uniform(-1.5, 1.5, (300, 3))
+    layer, own = rng.integers(0, 3, len(points)), rng.integers(0, 3, len(sought))
+    away = np.linalg.norm(sought[:, None] - points, axis=-1)
+    away[own[:, None] != layer] = np.inf
+    expected = np.where(away.min(1) < 0.3, away.argmin(1), -1)
+    assert 0 < (expected < 0).sum() < len(sought)
+    np.testing.assert_array_equal(NearestPoints(points, layer, 0.3).query(sought, own), expected)
+    alone = NearestPoints(points[:1], 0, 0.3)
+    beside = points[:1] + np.array([[0.2, 0, 0], [0.4, 0, 0]])
+    np.testing.assert_array_equal(alone.query(beside, 0), [0, -1])
 
 
 @pytest.mark.parametrize("seed", range(3))
