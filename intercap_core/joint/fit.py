@@ -40,7 +40,10 @@ from intercap_core.joint.terms.term import TermContext
 
 # Steps that each round tries at most; 12, 8 and 6 change errors by less than 0.1 mm, measured on
 # three recordings (bench/RESULTS.md).
-ROUND_STEPS = (6, 4, 3)
+ROUND_STEPS = (6, 4, 3, 3, 3)
+# Displacement of body and object over a round, metres: a smaller one ends the fit. A tenth of the
+# errors of the fit.
+UNCHANGED_M = 0.001
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +105,8 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    There are at most three rounds (``ROUND_STEPS``), fewer if a round changes nothing.
+    There are two to five rounds (``ROUND_STEPS``). The fit has converged if body and object moved
+    by less than ``UNCHANGED_M`` since the last round and contact is unchanged.
     ``intervals`` are the annotated contacts; None to detect contact. If the sequential fits
     contradict the floor, it is not used, and every frame is flagged.
     """
@@ -116,12 +120,12 @@ def fit(
     rounds = _Rounds(inputs, assembly, partial(estimate_contact, inputs, settings, intervals))
     for number, max_steps in enumerate(ROUND_STEPS, 1):
         rounds.minimise(max_steps)
-        if number == len(ROUND_STEPS):
+        converged = rounds.convergence == Convergence.CONVERGED
+        # the second round is the first with corrected cameras
+        if number == len(ROUND_STEPS) or (number > 1 and converged):
             break
         if cameras is not None and not cameras.refused:
             rounds.correct_cameras(cameras)
-        if rounds.convergence == Convergence.CONVERGED:
-            break
     state, convergence = rounds.state, rounds.convergence
     stalled = rounds.stalled | (convergence == Convergence.STALLED)
     log.log(
@@ -135,7 +139,7 @@ def fit(
     body, images = assembly.body, assembly.object_
     against_images = np.zeros(len(state), bool)
     if isinstance(images, ObjectImagesData):
-        against_images = images.contradicted(state)
+        against_images = images.contradicted()
     body.refresh(state)
     return JointFit(
         state=state,
@@ -176,13 +180,13 @@ class _Rounds:
         self.energy_before: dict[str, float] = {}
         self.energy_after: dict[str, float] = {}
         self.last_step_m = self.last_decrease = 0.0
+        self._last = self.state  # at the end of the last round
         self._unchanged = False  # the last round hardly changed state and contact
-        self._camera_shift = 0.0  # of the last correction, metres
 
     @property
     def convergence(self) -> Convergence:
         """Outcome so far."""
-        if self._unchanged and self._camera_shift < 0.0005:  # metres
+        if self._unchanged:
             return Convergence.CONVERGED
         if self.steps == 0 and self.refused > 0:
             return Convergence.STALLED
@@ -206,8 +210,11 @@ class _Rounds:
         converged = minimum.converged
         del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._contact_at(self.state)
+        changed_m = _displacement(self._geometry, self._last, self.state)
+        self._last = self.state
         contact_change = self.estimate.change(previous)
-        self._unchanged = bool(converged and contact_change < 0.1)  # tuned on the studio
+        # a tenth of the probability; tuned on the studio
+        self._unchanged = converged and changed_m < UNCHANGED_M and contact_change < 0.1
 
     def correct_cameras(self, cameras: CameraFit) -> None:
         """Correct ``cameras`` by the residuals of the body and of images of the object."""
@@ -219,15 +226,12 @@ class _Rounds:
             evidence.append(images.camera_evidence(self.state))
         correction = cameras.solve(evidence)
         if cameras.take(correction):
-            self._camera_shift = correction.shift
             log.info("cameras corrected by up to %.1f mm", 1e3 * correction.shift)
             self.state = self.state.moved(limited(correction.along))
         body.take_cameras(cameras.now)
         if isinstance(images, ObjectImagesData):
             images.take_cameras(cameras.now)
         if cameras.refused:
-            # the state was fitted to the corrected cameras: at least one more round
-            self._camera_shift, self._unchanged = 0.0, False
             log.warning(
                 "body and object would move a camera by %.0f mm, far more than the scene's "
                 "standard deviations: all cameras stay as in scene.h5; check their poses, the "

@@ -154,11 +154,11 @@ class ObjectImagesData(JointTerm):
             self._compared[t] = poses[t]
             self._set_form(t, evidence)
 
-    def contradicted(self, state: State) -> np.ndarray:
-        """Mask (T,) of tracked frames whose images contradict the object's pose at ``state``."""
-        compared = self._compare_images(rigid(state.rotation, state.translation))
-        contradicted = np.zeros(len(state), bool)
-        contradicted[[t for t, evidence in compared.items() if _contradicts(evidence)]] = True
+    def contradicted(self) -> np.ndarray:
+        """Mask (T,) of frames whose images contradict the object's pose at the last
+        :meth:`refresh`."""
+        contradicted = np.zeros(len(self._tracked.seen), bool)
+        contradicted[list(self._evidence.keys() - self._agreeing.keys())] = True
         return contradicted
 
     def _compare_images(self, poses: np.ndarray) -> dict[int, ImageEvidence]:
