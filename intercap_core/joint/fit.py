@@ -40,7 +40,7 @@ from intercap_core.joint.terms.term import TermContext
 
 # Steps that each round tries at most; 12, 8 and 6 change errors by less than 0.1 mm, measured on
 # three recordings (bench/RESULTS.md).
-ROUND_STEPS = (6, 4, 3, 3, 3)
+ROUND_STEPS = (6, 4, 3, 3)
 # Displacement of body and object over a round, metres: a smaller one ends the fit. A tenth of the
 # errors of the fit.
 UNCHANGED_M = 0.001
@@ -105,7 +105,7 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    There are two to five rounds (``ROUND_STEPS``). The fit has converged if body and object moved
+    There are two to four rounds (``ROUND_STEPS``). The fit has converged if body and object moved
     by less than ``UNCHANGED_M`` since the last round and contact is unchanged.
     ``intervals`` are the annotated contacts; None to detect contact. If the sequential fits
     contradict the floor, it is not used, and every frame is flagged.
@@ -207,14 +207,14 @@ class _Rounds:
         self.last_decrease = minimum.decrease
         self.stalled &= minimum.stalled
         log.info("%d steps, energy %.4g", self.steps, minimum.equations.total)
-        converged = minimum.converged
+        settled = minimum.converged or minimum.steps > 0  # not each step was refused
         del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._contact_at(self.state)
         changed_m = _displacement(self._geometry, self._last, self.state)
         self._last = self.state
         contact_change = self.estimate.change(previous)
         # a tenth of the probability; tuned on the studio
-        self._unchanged = converged and changed_m < UNCHANGED_M and contact_change < 0.1
+        self._unchanged = settled and changed_m < UNCHANGED_M and contact_change < 0.1
 
     def correct_cameras(self, cameras: CameraFit) -> None:
         """Correct ``cameras`` by the residuals of the body and of images of the object."""
