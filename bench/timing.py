@@ -6,8 +6,11 @@ import os
 
 import numpy as np
 
+from intercap_core.geometry.solve.thread_pool import VARIABLE
+
 os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the numerical libraries start
 THREADS = int(os.environ["OMP_NUM_THREADS"])
+os.environ[VARIABLE] = str(THREADS)
 AS_GOOD = 1.02  # factor of our error below which a result counts as equally accurate
 NEAR_BEST = 1.05  # factor of the smallest error of a recipe that counts as its best
 

@@ -38,7 +38,7 @@ from intercap_core.body_fit.surface import (
 from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 from intercap_core.geometry.solve.time_series import limited_velocity
 
 # Initial standard deviation of a keypoint whose constant offset is known, metres. It is refined
@@ -124,7 +124,7 @@ class Evidence:
         self.sample_joints = carrier[self.samples.vertex]
         self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
         # compiled code runs frame by frame, which threads can share
-        self._threads = ThreadPool(torch.get_num_threads())
+        self._threads = ThreadPool(threads_of_job())
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan)
         self.measured = torch.zeros(len(self.frames), len(self.samples.vertex), dtype=torch.bool)

@@ -21,7 +21,7 @@ from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 from intercap_core.schemas import PERSON, SCENE
 
 # Keypoints that place the trunk.
@@ -197,7 +197,7 @@ def person_clouds(frames: Path, observations: Observations, count: int) -> list[
     """Return the cloud of each frame, of about ``count`` points; None = no usable mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
-        return ThreadPool(torch.get_num_threads()).map(
+        return ThreadPool(threads_of_job()).map(
             lambda t: _fuse(reader, observations, t, count), range(observations.num_frames)
         )
 

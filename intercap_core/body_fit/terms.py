@@ -22,7 +22,6 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from intercap_core.body.correctives_kernel import (
@@ -48,7 +47,7 @@ from intercap_core.body_fit.term_inputs import (
     TermInputs,
 )
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
-from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 
 
 class CompiledTerms:
@@ -135,6 +134,6 @@ def _thread_pool(threads: int) -> ThreadPool:
 
 def _divide_frames(add_frames: Callable[[slice], None], count: int) -> None:
     """Call ``add_frames`` on ``count`` frames, in equal parts for each thread."""
-    threads = torch.get_num_threads()
+    threads = threads_of_job()
     step = max(1, -(-count // threads))
     _thread_pool(threads).map(add_frames, [slice(i, i + step) for i in range(0, count, step)])

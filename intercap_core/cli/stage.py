@@ -28,7 +28,7 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         output: Annotated[
             Path | None, typer.Option(help="Output path; default: its path in the project.")
         ] = None,
-        threads: Annotated[int, typer.Option(min=1, help="Threads of numerical libraries.")] = 1,
+        threads: Annotated[int, typer.Option(min=1, help="Threads to use.")] = 1,
     ) -> None:
         project = open_project(settings, sequence, threads)
         from intercap_core.pipeline.step import run_step

@@ -22,7 +22,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
 from intercap_core.joint.floor import FloorPlane
 from intercap_core.joint.geometry import Geometry
@@ -101,7 +101,7 @@ def open_inputs(
     if sequential.tracked is None:
         mesh = None
     geometry = _geometry(model, mesh, settings)
-    threads = ThreadPool(torch.get_num_threads())
+    threads = ThreadPool(threads_of_job())
     # one BLAS thread: small matrix products gain nothing from more, and would block ``threads``
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None

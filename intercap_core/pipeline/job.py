@@ -16,6 +16,7 @@ from pathlib import Path
 
 from intercap_core import disk
 from intercap_core.errors import UserError
+from intercap_core.geometry.solve.thread_pool import VARIABLE
 from intercap_core.signals import Terminated, raise_on_signals
 
 # Environment variables that limit the threads of the numerical libraries
@@ -35,9 +36,13 @@ ENDED = f"{UNEXPECTED} end"  # begins the reason of a job that a signal ended
 
 
 def set_threads(threads: int) -> None:
-    """Let the numerical libraries use ``threads`` threads; call it before they are imported."""
+    """Let a job use ``threads`` threads, of which the numerical libraries use one.
+
+    Results then do not depend on the number. Call it before the libraries are imported.
+    """
+    os.environ[VARIABLE] = str(threads)
     for variable in THREAD_VARIABLES:
-        os.environ[variable] = str(threads)
+        os.environ[variable] = "1"
 
 
 @contextmanager

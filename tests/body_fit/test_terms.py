@@ -293,15 +293,13 @@ def test_gradient_of_the_whole_energy_is_its_slope(exact: BodyProblem) -> None:
     torch.testing.assert_close((ahead - behind) / (2 * step), normal.gradient @ way)
 
 
-def test_number_of_threads_changes_nothing(exact: BodyProblem) -> None:
+def test_number_of_threads_changes_nothing(
+    exact: BodyProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own, shared, index = exact.own_start(), exact.shared_start(), torch.arange(FRAMES)
-    before = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            results.append(exact.linearise(own, shared, index))
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for threads in (1, 2):
+        monkeypatch.setenv("INTERCAP_THREADS", str(threads))
+        results.append(exact.linearise(own, shared, index))
     for single, double in zip(*results, strict=True):
         np.testing.assert_array_equal(single.numpy(), double.numpy())

@@ -6,7 +6,6 @@ Nothing in a model file is run as code except its graph; custom operators are no
 from __future__ import annotations
 
 import ast
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import parse_class_names
+from intercap_core.geometry.solve.thread_pool import threads_of_job
 from intercap_core.inputs.files import check_file, printable, referenced_files
 
 FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
@@ -113,7 +113,7 @@ class OnnxModel:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3  # only errors
         options.inter_op_num_threads = 1
-        options.intra_op_num_threads = _threads()
+        options.intra_op_num_threads = threads_of_job()
         if wanted not in onnxruntime.get_available_providers():
             raise _no_device(path, device, onnxruntime)
         try:
@@ -218,12 +218,6 @@ def _runtime_errors() -> tuple[type[Exception], ...]:
         c for c in vars(state).values() if isinstance(c, type) and issubclass(c, Exception)
     ]
     return (*of_status, RuntimeError, ValueError, TypeError)
-
-
-def _threads() -> int:
-    """Threads that the job may use, 0 = all; onnxruntime does not read OpenMP's variable."""
-    text = os.environ.get("OMP_NUM_THREADS", "")
-    return int(text) if text.isdecimal() else 0
 
 
 def _no_device(path: Path, device: str, runtime: Any) -> UserError:

@@ -9,7 +9,6 @@ runs without the global interpreter lock.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
@@ -21,7 +20,7 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Drawable, Rendering, Shot, Surface
-from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 
 # Triangles with a corner nearer than this are skipped, metres: the range of the Azure Kinect begins
 # at 0.25 m (data sheet).
@@ -66,26 +65,20 @@ def open_renderer(
 
     Args:
         device: the setting ``object_track.render_on``. Raises UserError for ``cuda``.
-        threads: default as many as the job may use (OMP_NUM_THREADS, else one).
+        threads: default as many as the job may use.
     """
     if device == "cuda":
         raise UserError(
             "object_track.render_on is 'cuda', expected 'cpu' or 'auto': objects are drawn on the "
             "CPU only; set object_track.render_on: cpu"
         )
-    return Renderer(_threads_of_job() if threads is None else threads)
+    return Renderer(threads_of_job() if threads is None else threads)
 
 
 @lru_cache(maxsize=1)
 def default_renderer() -> Renderer:
     """Return the renderer with as many threads as the job may use."""
-    return Renderer(_threads_of_job())
-
-
-def _threads_of_job() -> int:
-    """Return the number of threads that the job may use: OMP_NUM_THREADS, else one."""
-    given = os.environ.get("OMP_NUM_THREADS", "")
-    return int(given) if given.isdigit() and int(given) > 0 else 1
+    return Renderer(threads_of_job())
 
 
 def render(

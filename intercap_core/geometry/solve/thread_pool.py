@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
@@ -9,6 +10,17 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+VARIABLE = "INTERCAP_THREADS"
+
+
+def threads_of_job() -> int:
+    """Return the number of threads that the job may use: the variable INTERCAP_THREADS, else one.
+
+    The numerical libraries use one thread, since their rounding depends on the number of threads.
+    """
+    given = os.environ.get(VARIABLE, "")
+    return int(given) if given.isdecimal() and int(given) > 0 else 1
 
 
 class ThreadPool:

@@ -127,6 +127,6 @@ def test_a_gpu_is_refused():
 
 def test_threads_of_the_job(monkeypatch):
     default_renderer.cache_clear()
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setenv("INTERCAP_THREADS", "2")
     assert default_renderer().pool.threads == 2
     default_renderer.cache_clear()
