@@ -1,4 +1,4 @@
-"""`intercap dev bench`: seconds per frame and peak memory of a recording, by stage and in total."""
+"""`intercap dev bench`: seconds per frame and peak memory of recordings, by stage and in total."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from intercap_core import artefacts
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import snakemake_command
@@ -23,12 +25,14 @@ from intercap_core.schemas import FRAMES
 from intercap_core.stage_list import SEQUENCE_STAGES
 
 REPEATS = 3  # measured runs, after one that imports and compiles
+# The released InterCap dataset: sequences, and frames of all of them
+INTERCAP = (223, 67_357)
 # Stages from the frames to the metrics
 MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 
 
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
-    """Measure the project's first sequence and write flat JSON with the keys ``area.measure``.
+    """Measure the project's sequences and write flat JSON with the keys ``area.measure``.
 
     A recording of the studio is made first, which is not measured. Then the workflow runs all
     stages up to the metrics, so that the starts of processes are included. Keeps the figures of
@@ -39,9 +43,38 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     - ``end_to_end.seconds_per_frame``: duration of the whole run of the workflow.
     - ``end_to_end.peak_memory_mb``: largest sum of the resident memory of all processes.
     - ``frames.fps``, ``frames.bytes_...``: speed and size, see :func:`time_extraction`.
+    - ``scale.intercap_core_hours``: all jobs for ``INTERCAP``, see :func:`core_hours`; only for two
+      or more sequences.
+
+    Keys are those of the first sequence; for further sequences they end in ``_FRAMES``.
     """
     project = load_project(settings)
-    sequence = next(iter(project.sequences))
+    figures: dict[str, float] = {}
+    seconds_of_jobs: dict[int, float] = {}  # by number of frames
+    for sequence in project.sequences:
+        found, frames, cameras = _measure_sequence(project, sequence, cores)
+        seconds_of_jobs[frames] = frames * sum(
+            found[f"{stage}.seconds_per_frame"] for stage in MEASURED
+        )
+        _print(found, f"{sequence}: {frames} frame sets of {cameras} cameras")
+        if figures:
+            found = {f"{key}_{frames}": value for key, value in found.items()}
+        else:
+            found |= time_extraction(project, sequence, frames)
+            found |= time_hold_out(settings, sequence, frames)
+            _print_details(found)
+        figures |= found
+    if len(seconds_of_jobs) > 1:
+        hours = figures["scale.intercap_core_hours"] = core_hours(seconds_of_jobs)
+        print(f"InterCap, {INTERCAP[1]:,} frames: {hours:.1f} core hours")
+    add_figures(output, figures)
+    print(output)
+
+
+def _measure_sequence(
+    project: Project, sequence: str, cores: int
+) -> tuple[dict[str, float], int, int]:
+    """Compute a sequence; return its figures, and its numbers of frames and cameras."""
     recordings = project.recordings_made(sequence)
     if recordings is not None:
         _run(project, recordings / "capture.json", cores)
@@ -53,12 +86,20 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
         "end_to_end.seconds_per_frame": round(seconds / frames, 4),
         "end_to_end.peak_memory_mb": round(peak / (1 << 20), 1),
         **_stages(project, sequence, frames),
-        **time_extraction(project, sequence, frames),
-        **time_hold_out(settings, sequence, frames),
     }
-    add_figures(output, figures)
-    _print(figures, f"{sequence}: {frames} frame sets of {cameras} cameras")
-    print(output)
+    return figures, frames, cameras
+
+
+def core_hours(seconds: Mapping[int, float]) -> float:
+    """Hours that one core needs for the jobs of ``INTERCAP``.
+
+    ``seconds`` are those of a sequence's jobs by its number of frames. The law is a constant for
+    each sequence plus a constant for each frame (least squares).
+    """
+    frames = np.array(list(seconds), float)
+    per_frame, per_sequence = np.polyfit(frames, list(seconds.values()), 1)
+    total = per_sequence * INTERCAP[0] + per_frame * INTERCAP[1]
+    return round(float(total) / 3600, 2)
 
 
 def add_figures(output: Path, figures: Mapping[str, float]) -> None:
@@ -186,6 +227,9 @@ def _print(figures: dict[str, float], title: str) -> None:
             "" if memory is None else f"{memory:.0f}",
         )
     standard_console().print(table)
+
+
+def _print_details(figures: dict[str, float]) -> None:
     print(
         f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
         f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
