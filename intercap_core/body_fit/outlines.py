@@ -94,7 +94,7 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     # px; shorter rims, of spots and holes, are errors of the detector; tuned on the studio
     shortest = 40
     x, y, width, height = mask.box
-    pad = round(3 * blur)
+    pad = round(2 * blur)  # beyond two deviations the blur is cut off
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
     window[pad:-pad, pad:-pad] = np.uint8(255) * decode_box(mask.ends, mask.box, mask.height).T
     rims, _ = cv2.findContours(window, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -102,7 +102,7 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     if not rims:
         return np.zeros((0, 2)), np.zeros((0, 2))
     at = np.concatenate(rims)
-    soft = cv2.GaussianBlur(window, (0, 0), blur)
+    soft = cv2.GaussianBlur(window, (2 * pad + 1, 2 * pad + 1), blur)
     column, row = at.T
     left, right = soft[row, column - 1].astype(float), soft[row, column + 1]
     above, below = soft[row - 1, column].astype(float), soft[row + 1, column]
