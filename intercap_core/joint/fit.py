@@ -38,9 +38,9 @@ from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.terms.term import TermContext
 
-# Steps that each round tries at most; 12, 8 and 6 change errors by less than 0.1 mm, measured on
-# three recordings (bench/RESULTS.md).
-ROUND_STEPS = (6, 4, 3, 3)
+# Steps that the rounds accept at most. A second step in the later rounds changes errors by less
+# than 0.03 mm, twice as many steps in the first by less than 0.1 mm (bench/RESULTS.md).
+ROUND_STEPS = (6, 1, 1, 1)
 # Displacement of body and object over a round, metres: a smaller one ends the fit. A tenth of the
 # errors of the fit.
 UNCHANGED_M = 0.001

@@ -33,7 +33,9 @@ class Minimum:
 def minimise(
     linearise: Callable[[State], BandedEquations], state: State, *, max_steps: int
 ) -> Minimum:
-    """Try at most ``max_steps`` steps from ``state``; a step is accepted if it lowers the energy.
+    """Accept at most ``max_steps`` steps from ``state``, those that lower the energy.
+
+    Steps are tried twice as often at most.
 
     Each frame has its own damping, which grows if the energy rose there in a refused step: a badly
     linearised frame slows down its neighbourhood alone. The round has converged if a step lowers
@@ -46,7 +48,9 @@ def minimise(
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
     here, previous, decrease = linearise(state), state, 0.0
     before = here.energy
-    for _ in range(max_steps):
+    for _ in range(2 * max_steps):
+        if accepted == max_steps:
+            break
         step = here.step(damping)
         if step is None:
             damping, refused = damping * 10.0, refused + 1
