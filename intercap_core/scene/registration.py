@@ -301,25 +301,25 @@ class Registration:
         depth = np.maximum(in_target[:, 2:], 0.1)
         nearest = other.nearest.query(in_target * (1 + at.bias[b] / depth), moment)
         hit = np.flatnonzero(nearest >= 0)
-        nearest, points = nearest[hit], points[hit]
-        normals = surface.normals[nearest] @ target[:3, :3].T
-        own_normals = queries.normals[hit] @ source[:3, :3].T
-        on_target = apply(target, surface.points[nearest] - at.bias[b] * surface.rays[nearest])
-        speed = (queries.speed[hit] + surface.speed[nearest]) / 2
-        good = (normals * own_normals).sum(1) >= 0.85  # 32 degrees; tuned on the studio
+        queries, matched, points = queries.subset(hit), surface.subset(nearest[hit]), points[hit]
+        normals = matched.normals @ target[:3, :3].T
+        own_normals = queries.normals @ source[:3, :3].T
+        on_target = apply(target, matched.points - at.bias[b] * matched.rays)
+        speed = (queries.speed + matched.speed) / 2
+        good = _dot(normals, own_normals) >= 0.85  # 32 degrees; tuned on the studio
         # Mean of both normals: the residual of two points on one circle is then 0 (Rusinkiewicz, A
         # symmetric objective function for ICP, 2019).
         normals = normals + own_normals
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        residual = (normals * (points - on_target)).sum(1)
+        normals /= np.maximum(np.sqrt(_dot(normals, normals)), 1e-9)[:, None]
+        residual = _dot(normals, points - on_target)
         residual = residual - (at.offset[a] - at.offset[b]) * speed
         good &= np.abs(residual) <= gate
         return _Match(
             residual[good],
             points[good],
             normals[good],
-            queries.rays[hit[good]] @ source[:3, :3].T,
-            surface.rays[nearest[good]] @ target[:3, :3].T,
+            queries.rays[good] @ source[:3, :3].T,
+            matched.rays[good] @ target[:3, :3].T,
             speed[good],
         )
 
@@ -378,6 +378,11 @@ class Registration:
             gradient[c] += precision * away
 
 
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products (N,) of the vectors ``a`` and ``b`` (N, 3); faster than a sum over rows of three."""
+    return np.einsum("ni,ni->n", a, b)
+
+
 def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (n, 8) of the residuals by the unknowns of camera a, and of camera b.
 
@@ -389,7 +394,7 @@ def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray
 
     def rows(centre: np.ndarray, ray: np.ndarray) -> np.ndarray:
         turning = np.cross(m.points - centre, m.normals)
-        return np.column_stack([turning, m.normals, -(m.normals * ray).sum(1), -m.speed])
+        return np.column_stack([turning, m.normals, -_dot(m.normals, ray), -m.speed])
 
     return rows(centres[a], m.own_ray), -rows(centres[b], m.other_ray)
 

@@ -49,9 +49,8 @@ class DepthSurface:
 
     def subset(self, rows: np.ndarray) -> DepthSurface:
         """The points of some rows."""
-        return DepthSurface(
-            self.points[rows], self.normals[rows], self.rays[rows], self.speed[rows]
-        )
+        parts = (self.points, self.normals, self.rays, self.speed)
+        return DepthSurface(*(part.take(rows, 0) for part in parts))
 
 
 class NearestPoints:
