@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
 from intercap_core.geometry.camera import projection
@@ -119,14 +119,15 @@ def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.
     tried, costs = 10.0 ** np.arange(-3, 4), []
     for stiffness in tried:
         factor = _factor(stiffness, known, penalty)
-        path = cho_solve_banded((factor, False), right)
+        path = dpbtrs(factor, right)[0]
         energy = max(float((right * (points - path)).sum()), 1e-12)
         # -2 log restricted likelihood of the three coordinates, up to a constant
         cost = 3 * (samples - 3) * np.log(energy)
         cost += 3 * (2 * np.log(factor[-1]).sum() - (sets - 3) * np.log(stiffness))
         costs.append(cost)
     likely = tried[int(np.argmin(costs))]
-    return cho_solve_banded((_factor(4.0 * likely, known, penalty), False), right)
+    path, _ = dpbtrs(_factor(4.0 * likely, known, penalty), right)
+    return path
 
 
 def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
@@ -134,7 +135,11 @@ def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndar
     sample."""
     matrix = stiffness * penalty
     matrix[-1] += known + 1e-9
-    return cholesky_banded(matrix)
+    # LAPACK itself, since SciPy's wrappers take longer than the factorisation of a short path
+    factor, failed = dpbtrf(matrix)
+    if failed:
+        raise np.linalg.LinAlgError("the smoother's matrix is not positive definite")
+    return factor
 
 
 def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
