@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -12,9 +10,8 @@ from intercap_core import artefacts
 from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
 from tests.helpers.kinect_files import (
@@ -75,13 +72,6 @@ def test_cameras_poses_and_gravity(capture):
     with Frames.open(output) as frames:
         down = cv2.Rodrigues(np.array([0.1, 0, 0]))[0] @ [0, 1, 0]
         assert np.allclose(frames.gravity, down[None], atol=1e-6)
-
-
-def test_degraded_cameras_are_noted(capture):
-    notes = notes_of(run(capture))
-    assert notes["k1"] == ""
-    assert "no image in 1 frame sets" in notes["k2"]
-    assert "ends 1 frame sets early" in notes["k3"]
 
 
 def test_dropped_sets_have_no_image(capture):
@@ -191,31 +181,6 @@ def test_user_errors_leave_no_file(capture, fault, words):
     with pytest.raises(UserError, match=words):
         fault(capture)
     assert not list(capture.calibration.parent.rglob("*frames.h5*"))
-
-
-def test_release_folder_gives_poses_relative_to_its_first_camera(tmp_path):
-    rng = np.random.default_rng(0)
-    world = {}
-    for number in (1, 2, 3):
-        turn, shift = rng.normal(size=3), rng.normal(size=3)
-        name = "Color.json" if number == 1 else f"Color_{number}.json"
-        (tmp_path / name).write_text(json.dumps({"R": turn.tolist(), "T": [[v] for v in shift]}))
-        world[number] = rigid(cv2.Rodrigues(turn)[0], shift)
-    extrinsics = read_extrinsics(tmp_path)
-    assert extrinsics.master == "k1"
-    assert np.array_equal(extrinsics.master_from_colour["k1"], np.eye(4))
-    point = np.array([0.3, -0.2, 2.0, 1.0])
-    for number in (2, 3):
-        in_camera = world[number] @ point
-        in_master = extrinsics.master_from_colour[f"k{number}"] @ in_camera
-        assert np.allclose(in_master, world[1] @ point)
-
-
-def test_a_rig_file_written_is_read_back(tmp_path):
-    poses = {"k1": pose_of(1), "k2": pose_of(2)}
-    write_rig_file(tmp_path / "rig.json", Extrinsics("k1", poses))
-    again = read_extrinsics(tmp_path / "rig.json").master_from_colour
-    assert np.allclose(poses["k1"] @ again["k2"], poses["k2"])
 
 
 def test_real_recording_goes_through_the_stage(tmp_path, real_recording):

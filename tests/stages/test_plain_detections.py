@@ -49,47 +49,6 @@ def found(capture: SequenceEntry) -> dict[str, list[float]]:
     }
 
 
-def candidates(capture: SequenceEntry, content: list) -> tuple[list[list[float]], str]:
-    """The right camera's boxes by frame set where it has candidates, and its note."""
-    folder = capture.recordings.parent / "candidates"
-    folder.mkdir()
-    (folder / "right.json").write_text(json.dumps(content))
-    read = detect(capture.model_copy(update={"keypoints": None, "candidates": folder}))
-    assert not read.candidates_found[:, 0].any()
-    boxes = [[float(c.box[0]) for c in read.candidates(t, 1)] for t in range(read.num_sets)]
-    return boxes, read.notes[1]
-
-
-def corners(x: int) -> dict:
-    polygon = [x, 2, x + 8, 2, x + 8, 9, x, 9]
-    return {"category_name": "cup", "score": 1.0, "segmentation": [polygon]}
-
-
-@pytest.mark.parametrize("key", ["file_name", "image_id"])
-def test_candidates_named_after_the_images_follow_them(capture, key):
-    named = [corners(n) | {"image_id": n - 1, key: f"right/shot_{n:04d}.jpg"} for n in range(1, 8)]
-    boxes, note = candidates(capture, named)
-    assert boxes == [[1], [], [3], [], [5], [6]]
-    assert "2 results" in note and "(first: right/shot_0004.jpg;" in note
-
-
-def test_images_of_a_dataset_are_matched_by_name(capture):
-    content = {
-        "images": [{"id": 7 * n, "file_name": f"shot_{n:04d}.jpg"} for n in (5, 3)],
-        "annotations": [corners(n) | {"image_id": 7 * n} for n in (5, 3)],
-    }
-    boxes, note = candidates(capture, content)
-    assert boxes == [[], [], [3], [], [5], []] and note.count("results") == 0
-
-
-def test_candidates_numbered_by_place_count_damaged_images(capture):
-    there = [n for n in range(1, 7) if n != ABSENT]
-    boxes, _ = candidates(
-        capture, [corners(n) | {"image_id": place} for place, n in enumerate(there)]
-    )
-    assert boxes == [[1], [], [3], [], [5], [6]]
-
-
 def test_files_numbered_by_place_count_damaged_images(capture):
     for place in range(6):
         keypoints(capture.keypoints / "left" / f"{place:012d}_keypoints.json", place + 1)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,14 +15,11 @@ from intercap_core.formats.calibration.k4a import DEPTH_MODES
 from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.recording import Kinect, surfaces_at
-from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
-from intercap_core.studio.room import build_room
-from intercap_core.studio.sensors import DepthSensor, LargeErrors
-from intercap_core.studio.stage import StudioStage, check_capture
-from intercap_core.studio.subjects import body_colours
+from intercap_core.studio.recording import Kinect
+from intercap_core.studio.rig import StudioRig, build_rig, started_apart
+from intercap_core.studio.sensors import LargeErrors
+from intercap_core.studio.stage import check_capture
 from tests.helpers.fitted_capture import object_entry
 
 FRAMES, FPS = 8, 5
@@ -59,11 +54,6 @@ def test_two_cameras_slip_by_one_to_four_frames(seed: int) -> None:
     assert not rig.slip.any() and np.abs(rig.offset_s).max() <= 0.008 and rig.offset_s[0] == 0
 
 
-def test_some_slips_last_to_the_end_and_some_do_not() -> None:
-    lasting = [rig_of(seed, slips="silent").slip[-1].any() for seed in range(30)]
-    assert 5 < sum(lasting) < 28
-
-
 @pytest.mark.parametrize("fps", [15, 30, 60])
 def test_late_starts_are_whole_sets_plus_a_fraction(fps: int) -> None:
     rig = rig_of(5)
@@ -89,18 +79,6 @@ def test_all_depth_modes_share_one_lens(mode: str) -> None:
     np.testing.assert_allclose(places[1], places[0], atol=1e-12)
 
 
-def test_only_the_masters_clock_has_no_jitter() -> None:
-    noise = NoiseSource(5, 1.0, "a", 30.0)
-    failures = Failures.draw(noise, capture_of(400), 4)
-    assert not failures.jitter_s[:, 0].any()
-    assert 80e-6 < failures.jitter_s[:, 1:].std() < 120e-6
-    assert np.abs(failures.jitter_s).max() < 301e-6
-    lost = failures.depth_away | failures.depth_empty
-    assert lost.any(0).sum() == 1 and 1 <= lost.sum() <= 9 and not lost[:, 0].any()
-    still = Failures.draw(NoiseSource(5, 0.0, "a", 30.0), capture_of(400), 4)
-    assert not still.jitter_s.any() and not still.depth_away.any()
-
-
 def test_without_overlap_only_the_master_sees_the_middle() -> None:
     rig = rig_of(2, "no_overlap")
     middle = rig.master_from_stage[:3, 3] + rig.master_from_stage[:3, 2] * 0.85
@@ -109,51 +87,10 @@ def test_without_overlap_only_the_master_sees_the_middle() -> None:
         assert bool(camera.colour.sees(at)) == (index == 0)
 
 
-def test_large_depth_errors_stay_within_the_data_sheet() -> None:
-    drawn = [LargeErrors.draw(NoiseSource(seed, 1.0, "a", 15.0), 6) for seed in range(200)]
-    bias = np.array([[camera.bias_m for camera in cameras] for cameras in drawn])
-    assert np.abs(bias).max() <= 0.011 and 0.004 < bias.std() < 0.006
-    worst = np.abs(bias).argmax(1) == 0  # the master: half of all, and a sixth of the others
-    assert 0.45 < worst.mean() < 0.7
-    still = LargeErrors.draw(NoiseSource(1, 0.0, "a", 15.0), 2)
-    assert still[0].bias_m == still[1].slope == 0
-
-
 def test_depth_errors_grow_with_distance_and_incidence() -> None:
     errors = LargeErrors(bias_m=0.004, slope=0.001)
     depth, cosine = np.array([2.5, 3.5, 2.5]), np.array([-1.0, 1.0, 0.5])
     np.testing.assert_allclose(errors.at(depth, cosine), [0.004, 0.005, 0.008])
-
-
-@cache
-def depth_images(kind: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Depth image, metres, mask of the hands' pixels, and bias of one camera."""
-    stage = StudioStage(
-        capture_of(2, depth_errors=kind, room="bare"), StudioSettings(captures={}, cameras=2),
-        object_entry("stool"),
-    )  # fmt: skip
-    kinect = Kinect(stage, 0, "1080P")
-    moment = stage.at(kinect.exposures)
-    large = LargeErrors.draw(stage.noise, 2)[0] if kind == "large" else None
-    view = kinect._views()[1]
-    sensor = DepthSensor(view, stage.noise, "k1", large=large)
-    surfaces = surfaces_at(stage, moment, 0, body_colours(stage.subject, np.random.default_rng(0)))
-    at = stage.keypoints(moment)[0, 25:67] @ view.camera_from_stage[:3, :3].T
-    u, v = np.rint(view.lens.project(at + view.camera_from_stage[:3, 3])).astype(int).T
-    hands = np.zeros((view.lens.height, view.lens.width), bool)
-    hands[v, u] = True
-    hands = cv2.dilate(hands.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    return sensor.image(view.cast(surfaces)) / 1000.0, hands, sensor.bias
-
-
-def test_hands_get_holes_and_the_room_the_bias() -> None:
-    usual, hands, usual_bias = depth_images("usual")
-    large, _, bias = depth_images("large")
-    holes = (usual > 0) & (large == 0)
-    assert holes[hands].mean() > 0.2 > 0.1 > holes[~hands].mean()
-    both = (usual > 0) & (large > 0)
-    grazing = 0.0005  # of a floor and a person, seen by a camera that looks down
-    assert np.median((large - usual)[both]) > bias - usual_bias + grazing
 
 
 @pytest.fixture(scope="module")
@@ -233,30 +170,6 @@ def test_impossible_captures_are_refused(capture: dict[str, object], says: str) 
     name = "skateboard" if "shoes" in capture else "stool"
     with pytest.raises(UserError, match=says):
         check_capture(StudioCapture(**values), settings, name)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("layout", ["k4a", "intercap", "behave"])
-def test_kinects_refuse_sixty_frames_a_second(layout: str) -> None:
-    capture = StudioCapture(interaction="stool_sit", subject="s02", seed=1, layout=layout)
-    fast = StudioSettings(captures={}, fps=60)
-    with pytest.raises(UserError, match=f"{layout!r} have at most 30 frames a second"):
-        check_capture(capture, fast, "stool")
-    check_capture(capture.model_copy(update={"layout": "plain"}), fast, "stool")
-
-
-def test_keypoint_bias_scales_body_joints_only() -> None:
-    noise = NoiseSource(3, 1.0, "a", 15.0)
-    usual, other = (Detector.build(noise, 9, scale).body_bias for scale in (1.0, 1.6))
-    np.testing.assert_allclose(other[:25], 1.6 * usual[:25])
-    np.testing.assert_array_equal(other[25:], usual[25:])
-
-
-def test_a_sparse_room_has_a_floor_and_two_low_pieces() -> None:
-    eyes = 2.5 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(6) * np.pi / 3])
-    for furnishing, boxes, top in (("bare", 0, 0.0), ("sparse", 2, 0.4)):
-        room = build_room(np.random.default_rng(4), [], eyes, furnishing=furnishing)
-        assert len(room.vertices) == 4 + 8 * boxes
-        assert room.vertices[:, 2].max() <= top
 
 
 def test_redrawn_detections_keep_the_recording() -> None:

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.studio.keypoints import Detector
-from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.passer_by import PasserBy
 from intercap_core.studio.stage import StudioStage
 from tests.helpers.fitted_capture import object_entry
@@ -64,12 +62,6 @@ def test_a_second_person_stands_and_watches() -> None:
     assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
 
 
-def test_a_walker_is_present_only_near_the_passage(walker: PasserBy) -> None:
-    times = walker.way.when + np.array([-20.0, -2.0, 0.0, 2.0, 20.0])
-    present = walker.at(times).present
-    assert present.tolist() == [False, True, True, True, False]
-
-
 def test_a_passer_by_leaves_the_recording_unchanged(stage: StudioStage) -> None:
     alone = stage_with("nobody")
     ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))
@@ -77,16 +69,3 @@ def test_a_passer_by_leaves_the_recording_unchanged(stage: StudioStage) -> None:
     np.testing.assert_array_equal(ours.stage_from_object, theirs.stage_from_object)
     np.testing.assert_array_equal(stage.room.vertices, alone.room.vertices)
     np.testing.assert_array_equal(stage.rig.offset_s, alone.rig.offset_s)
-
-
-def test_a_walker_is_detected_only_while_visible(stage: StudioStage) -> None:
-    detector = Detector.build(NoiseSource(3, 1.0, "a", 5.0), 60)
-    subject, walker = np.zeros((135, 3)), np.ones((60, 135, 3))
-    hidden = np.zeros((60, 135), bool)
-    hidden[40:] = True
-    camera = stage.rig.true[0]
-    people = detector.with_passer_by(camera, [[subject] for _ in range(60)], walker, hidden)
-    places = [[person is not subject for person in found].index(True) for found in people[:40]
-              if len(found) == 2]  # fmt: skip
-    assert len(places) > 30 and 5 < sum(places) < len(places) - 5
-    assert all(len(found) == 1 for found in people[40:])

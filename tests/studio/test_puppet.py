@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
-from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.interactions.grasps import Hollow
 from intercap_core.studio.interactions.handling import HandlingScript
@@ -42,15 +40,6 @@ def test_fingers_flex_towards_the_palm(side: int) -> None:
     )
     assert (fist_tips - open_tips) @ hand.palm > 0.01
     assert (fist_tips - open_tips) @ hand.out < -0.02
-
-
-def test_walls_block_half_of_all_directions_shells_all() -> None:
-    wall = trimesh.creation.box((20.0, 20.0, 0.02))
-    share = Hollow(DistanceField(wall.vertices, wall.faces)).share(np.array([[0, 0, 0.02]]))
-    assert share[0] == pytest.approx(0.5, abs=2 / Hollow.directions)
-    shell = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    inside = Hollow(DistanceField(shell.vertices, shell.faces)).share(np.zeros((1, 3)))
-    assert inside[0] == 1
 
 
 @pytest.mark.parametrize("subject", ["s03", pytest.param("s06", marks=pytest.mark.full)])

@@ -11,12 +11,10 @@ from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.studio.render import (
     BODY,
-    CAMERA_GAMMA,
     OBJECT,
     MovingSurface,
     RoomView,
     scene_of,
-    shade,
 )
 from intercap_core.studio.rig import build_rig
 from intercap_core.studio.room import build_room
@@ -82,8 +80,3 @@ def test_moving_surfaces_are_drawn_where_rays_hit(
     assert (cast.normal[both][ball] * outward).sum(1).min() > 0.995
     np.testing.assert_allclose(np.linalg.norm(cast.normal, axis=1), 1, atol=1e-5)
     assert view.count(surfaces[1]) >= (cast.identity == OBJECT).sum()
-
-
-def test_the_room_is_lit_from_above() -> None:
-    up, down = shade(np.array([[0, 0, 1.0], [0, 0, -1.0]], np.float32)) ** CAMERA_GAMMA
-    assert up > 0.8 > 0.5 > down
