@@ -122,7 +122,10 @@ use rule * from intercap
 
 @pytest.mark.parametrize(
     ("layout", "sequence"),
-    [("intercap", "s03_o01_seg1"), ("behave", "Date03_Sub03_suitcase_carry")],
+    [
+        pytest.param("intercap", "s03_o01_seg1", marks=pytest.mark.full),
+        ("behave", "Date03_Sub03_suitcase_carry"),
+    ],
 )
 def test_three_commands_need_no_checkout(
     packages: Path, flow: Flow, tmp_path: Path, layout: str, sequence: str

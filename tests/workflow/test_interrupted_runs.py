@@ -77,6 +77,7 @@ def test_a_terminated_run_reports_once_and_leaves_no_parts(victim: Victim, numbe
     assert victim.left_over() == [] and not victim.flow.artefact(ONE, "person").exists()
 
 
+@pytest.mark.full
 def test_plain_snakemake_continues_after_a_killed_one(victim: Victim) -> None:
     """Its lock is removed; inputs and results are dated ahead of the clock."""
     whole = contents(victim.flow.results)
