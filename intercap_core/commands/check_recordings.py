@@ -253,6 +253,7 @@ def _notes_on_keypoints(
             "triangulated; add the keypoints of another camera, or depth"
         )
     layouts: set[str] = set()
+    usable = 0
     for name in cameras:
         if keypoint_files.has_keypoints(folder, name):
             if name in findings.images:
@@ -268,11 +269,17 @@ def _notes_on_keypoints(
                 findings.faults += preview.faults
                 findings.add_recognised("keypoints", preview.recognised)
                 layouts |= preview.layouts
+                usable += preview.usable
         elif settings.keypoint_model is None:
             notes.append(
                 f"{folder} has no file of keypoints for {name}; add this camera's keypoints "
                 f"({name}.json or {name}/<image>_keypoints.json)"
             )
+    if {*having} & {*findings.images} and not usable and settings.keypoint_model is None:
+        findings.faults.append(
+            f"{folder}: the first keypoints of {', '.join(having)} cannot be used, so no person "
+            "will be found; the notes say why (docs/detectors.md)"
+        )
     counts = [len(keypoint_layouts()[name].points) for name in layouts]
     if len(set(counts)) < len(counts):
         notes.append(

@@ -95,7 +95,7 @@ def test_the_halpe_points_of_pose2sim_are_read(tmp_path):
 def test_masks_of_shares_of_the_image_are_scaled(tmp_path):
     project = open_case("b14", tmp_path)
     row = project.sequences[SEQUENCE]
-    assert "candidates: corners are shares of the image's size" in check(project).summary
+    assert "(candidates): corners are shares of the image's size" in check(project).summary
     found = candidate_files.read_camera(
         row.candidates, camera(4), layout="plain", min_score=0.0, names={}
     )

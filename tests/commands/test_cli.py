@@ -347,6 +347,10 @@ def test_check_refuses_a_sequence_without_keypoints(inside: Path) -> None:
     (inside / "points" / "k1").rename(inside / "points" / "camera1")
     (fault,) = faults()
     assert fault.startswith("sequence 'good': points: no keypoints of k1, and no keypoint model is")
+    for content in ("{", '[{"image_id": 0, "keypoints": [1, 2, 3]}]'):
+        (inside / "points" / "k1.json").write_text(content)
+        assert "the first keypoints of k1 cannot be used, so no person will be" in faults()[0]
+    (inside / "points" / "k1.json").unlink()
     table = Path("sequences.tsv")
     table.write_text(table.read_text().replace("\tpoints\n", "\t\n"))
     (fault,) = faults()

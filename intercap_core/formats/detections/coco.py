@@ -101,6 +101,8 @@ class DetectionPreview:
     """Names of the keypoints' layouts; empty for candidates."""
     recognised: list[str] = field(default_factory=list)
     """Properties recognised by content: layout, numbering, unit."""
+    usable: bool = True
+    """Whether any of the keypoints can be used; True for candidates."""
 
 
 CandidateFile = DetectionFile[Instance]

@@ -498,7 +498,9 @@ def preview_keypoints(
     single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
     if whole is None and single is not None:
         preview_names(preview, folder / images.name, single[0], images)
-    first = _load_first(folder, images.name, preview.notes)
+    unreadable: list[str] = []
+    first = _load_first(folder, images.name, unreadable)
+    preview.notes += unreadable
     if first is None:
         return preview
     loaded, reader = first
@@ -513,7 +515,7 @@ def preview_keypoints(
                 entries, faults = entries + parsed.entries, faults + parsed.faults
                 people = [person for _, person in parsed.results]
                 reading.raw[number] = np.stack(people) if people else NOBODY
-                reading.used = True
+                reading.used |= bool(people) or not parsed.faults
         if faults:
             reading.notes.append(
                 f"{len(faults)} of its first {entries} people cannot be used (first: {faults[0]})"
@@ -527,6 +529,7 @@ def preview_keypoints(
     except UserError as error:
         preview.faults.append(str(error))
         return preview
+    preview.usable = reading.used if loaded else not unreadable
     preview.recognised += found.recognised
     preview.layouts = reading.assumed if reading.layout is None else {reading.layout}
     where = next(iter(loaded), folder)
