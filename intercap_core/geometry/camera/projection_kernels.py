@@ -113,7 +113,10 @@ def unproject(pixels, parameters, radii, distorted_radii):
         if distance > distorted_radii[-1]:
             scale = radii[-1] / distorted_radii[-1]
         elif distance > 0:
-            scale = np.interp(distance, distorted_radii, radii) / distance
+            at = np.searchsorted(distorted_radii, distance)
+            low, high = distorted_radii[at - 1], distorted_radii[at]
+            share = (distance - low) / (high - low)
+            scale = (radii[at - 1] + share * (radii[at] - radii[at - 1])) / distance
         x, y = xd * scale, yd * scale
         off = np.inf
         for _ in range(8):
