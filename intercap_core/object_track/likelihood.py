@@ -23,7 +23,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.object_depth import rotated_normal
 from intercap_core.object_track.object_silhouette import nearest, rim_pixels, transform_point
-from intercap_core.object_track.reduced_mask import EMPTY, covers
+from intercap_core.object_track.reduced_mask import EMPTY, covers, cut
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
@@ -213,15 +213,9 @@ def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigm
     margin = max(h, w) // 2 + 2
     left, top = x0 - margin, y0 - margin
     rows, columns = h + 2 * margin, w + 2 * margin
-    drawn = np.zeros((rows, columns), np.bool_)
-    inside, other = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.bool_)
-    for y in range(rows):
-        for x in range(columns):
-            u, v = x - margin, y - margin
-            if 0 <= u < w and 0 <= v < h:
-                drawn[y, x] = face[v, u] >= 0
-            inside[y, x] = covers(mask, x + left - mx, y + top - my)
-            other[y, x] = not inside[y, x] and covers(person, x + left - px, y + top - py)
+    drawn = cut(face >= 0, margin, margin, 0, 0, rows, columns)
+    inside = cut(mask, mx, my, left, top, rows, columns)
+    other = cut(person, px, py, left, top, rows, columns) & ~inside
     edge, edge_starts = rim_pixels(drawn)
     border, border_starts = rim_pixels(inside)
     limit = sigma * np.sqrt(2 * most)

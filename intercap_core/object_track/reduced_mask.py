@@ -30,15 +30,7 @@ class ReducedMask:
 
     def window(self, x0: int, y0: int, height: int, width: int) -> np.ndarray:
         """Return the mask in another window of the reduced image, False outside of its own."""
-        result = np.zeros((height, width), bool)
-        own_height, own_width = self.mask.shape
-        left, right = max(x0, self.x0), min(x0 + width, self.x0 + own_width)
-        top, bottom = max(y0, self.y0), min(y0 + height, self.y0 + own_height)
-        if left < right and top < bottom:
-            result[top - y0 : bottom - y0, left - x0 : right - x0] = self.mask[
-                top - self.y0 : bottom - self.y0, left - self.x0 : right - self.x0
-            ]
-        return result
+        return cut(self.mask, self.x0, self.y0, x0, y0, height, width)
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the mask (N,) at integer reduced pixels x, y (N,)."""
@@ -54,6 +46,22 @@ class ReducedMask:
     def area(self) -> int:
         """Number of pixels set."""
         return int(np.count_nonzero(self.mask))
+
+
+@numba.njit(cache=True, nogil=True)
+def cut(mask, x0, y0, left, top, height, width):
+    """Return a mask (h, w) whose first pixel is (x0, y0) in the window from (left, top).
+
+    The result (height, width) bool is False outside of the mask.
+    """
+    result = np.zeros((height, width), np.bool_)
+    first, last = max(left, x0), min(left + width, x0 + mask.shape[1])
+    upper, lower = max(top, y0), min(top + height, y0 + mask.shape[0])
+    if first < last and upper < lower:
+        result[upper - top : lower - top, first - left : last - left] = mask[
+            upper - y0 : lower - y0, first - x0 : last - x0
+        ]
+    return result
 
 
 @numba.njit(cache=True, nogil=True)
@@ -130,18 +138,19 @@ def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedM
         The largest remaining part. None if the candidate does not cover the person, or nothing
             else.
     """
-    if not mask.area or not person.area:
+    least = 0.25 * person.area  # pixels of the person that the candidate covers
+    if not person.area or mask.area < least:
         return None
     here = person.window(mask.x0, mask.y0, *mask.mask.shape)
-    if (here & mask.mask).sum() < 0.25 * person.area:
+    if (here & mask.mask).sum() < least:
         return None
     rest = (mask.mask & ~here).astype(np.uint8)
     border_px = 6.0  # difference of two masks of one person at their borders, at full resolution
     size = max(3, 2 * round(0.5 * border_px / step) + 1)
     opened = cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
-    count, parts, sizes, _ = cv2.connectedComponentsWithStats(opened)
-    if count < 2:
+    if not opened.any():
         return None
+    _, parts, sizes, _ = cv2.connectedComponentsWithStats(opened)
     largest = 1 + int(sizes[1:, cv2.CC_STAT_AREA].argmax())
     left, top, width, height, area = sizes[largest]
     if area < 0.01 * mask.area:
