@@ -269,9 +269,10 @@ def _sampson_distances(
         focal: focal length, pixels at 1080p.
     """
     x, y = (np.concatenate([rays, np.ones_like(rays[..., :1])], -1) for rays in (first, second))
-    line, back = (x @ essential.T)[:, :, None], (y @ essential)[:, None]
-    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
-    return focal * (line * y[:, None]).sum(-1) / np.maximum(size, 1e-12)
+    line, back = x @ essential.T, y @ essential
+    squares = [of[..., 0] ** 2 + of[..., 1] ** 2 for of in (line, back)]
+    size = np.sqrt(squares[0][:, :, None] + squares[1][:, None])
+    return focal * np.einsum("tpki,tqki->tpqk", line, y) / np.maximum(size, 1e-12)
 
 
 def known_mean(values: np.ndarray) -> np.ndarray:
