@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numba
@@ -96,22 +97,32 @@ class ColourCells:
         Holes between projected cells are closed morphologically (3 x 3), except over cells of the
         points ``others`` (N,) bool.
         """
-        cells = self.cell[chosen & (self.cell >= 0)]
-        if not len(cells):
+        row, column = self._places(chosen)
+        if not len(row):
             return b""
-        row, column = np.divmod(cells, self.width)
         top, left = max(int(row.min()) - 2, 0), max(int(column.min()) - 2, 0)
         bottom, right = int(row.max()) + 3, int(column.max()) + 3
         drawn = np.zeros((bottom - top, right - left), np.uint8)
         drawn[row - top, column - left] = 1
         mask = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        taken_row, taken_column = np.divmod(self.cell[others & (self.cell >= 0)], self.width)
+        taken_row, taken_column = self._places(others)
         near = (taken_row >= top) & (taken_row < bottom)
         near &= (taken_column >= left) & (taken_column < right)
         mask[taken_row[near] - top, taken_column[near] - left] = 0
         mask[row - top, column - left] = 1
         width, height = self.colour_size
         return encode_window(mask, left, top, self.scale, width, height)
+
+    def _places(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the cells of the visible points among ``chosen`` (N,) bool."""
+        visible = np.flatnonzero(chosen & (self.cell >= 0))
+        rows, columns = self._rows_and_columns
+        return rows.take(visible), columns.take(visible)
+
+    @cached_property
+    def _rows_and_columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) each; divided once because an image has many candidates."""
+        return np.divmod(self.cell, self.width)
 
 
 def encode_window(

@@ -76,14 +76,12 @@ def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarr
     rows = [(at[a], at[b], size * ra, size * rb, margin) for (a, b), (ra, rb, margin) in radii]
     for side in ("left", "right"):
         rows += _hand(at, side)
-    bones = np.array(
-        [
-            [*a[:3], *b[:3], ra, rb, np.hypot(margin, (a[3] + b[3]) / 2)]
-            for a, b, ra, rb, margin in rows
-        ],
-        np.float32,
-    )
-    return bones[np.isfinite(bones).all(1)].reshape(-1, 9)
+    a, b, *others = zip(*rows, strict=True)
+    first, second = np.array(a), np.array(b)
+    radii_and_margin = np.array(others).T
+    radii_and_margin[:, 2] = np.hypot(radii_and_margin[:, 2], (first[:, 3] + second[:, 3]) / 2)
+    bones = np.concatenate([first[:, :3], second[:, :3], radii_and_margin], 1).astype(np.float32)
+    return bones[np.isfinite(bones).all(1)]
 
 
 def _hand(
