@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
 
-from bench import verdict as bench
 from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors, verdict_figures
@@ -140,28 +138,3 @@ def test_odd_against_even_is_of_frames_with_a_stated_error() -> None:
 def test_no_figures_without_verdict_or_truth() -> None:
     bare = SequenceMetrics("a", "p", "cup", 30.0, False, {})
     assert not stated_errors(bare) and verdict_figures([bare]) == {}
-
-
-def test_calibration_is_found_again() -> None:
-    rng = np.random.default_rng(7)
-    size = rng.uniform(0.001, 0.02, 400)
-    true = 0.7 * size * np.exp(rng.normal(0, 0.1, len(size)))
-    found, stated = bench.calibrate(bench.Samples(size, true, np.repeat(["a", "b"], 200)))
-    assert found.scale == pytest.approx(0.7, rel=0.03)
-    # four of five of a normal deviate are within 1.28 deviations
-    assert found.spread == pytest.approx(np.exp(1.28 * 0.1), rel=0.03)
-    assert np.median(np.abs(np.log(stated / true))) < 0.08
-
-
-def test_spread_holds_for_a_kind_that_the_scale_has_not_seen() -> None:
-    size, kind = np.ones(50), np.repeat(["a", "b"], [40, 10])
-    true = np.where(kind == "a", 1.0, 2.0)  # errors of kind b are twice as large
-    found, stated = bench.calibrate(bench.Samples(size, true, kind))
-    assert found.scale == pytest.approx(np.sqrt(2))  # both kinds count alike
-    assert found.spread == pytest.approx(2)
-    np.testing.assert_allclose(stated, np.where(kind == "a", 2.0, 1.0))
-
-
-def test_file_without_verdict_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert bench.main([str(tmp_path / "absent.h5")]) == 2
-    assert "absent.h5" in capsys.readouterr().err
