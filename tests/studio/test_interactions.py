@@ -17,8 +17,6 @@ from intercap_core.studio.interactions.alone import BeamWalk
 from intercap_core.studio.interactions.slipping import (
     GlidingSwing,
     Regrasp,
-    TurningSwing,
-    along_and_about,
 )
 from intercap_core.studio.stage import StageState, StudioStage
 from tests.studio.studio_stage import make_stage
@@ -41,8 +39,6 @@ class Case:
     rests: tuple[tuple[float, float], ...]
     """Script times in which the object does not move."""
     on_floor: bool = True
-    pressed_m: float = 0.006
-    """Deepest penetration before flesh gives way."""
     object_m_s: float = 2.5
     joint_m_s: float = 4.5
     joint_m_s2: float = 100.0
@@ -57,7 +53,7 @@ CASES = {
     "cup_drink": Case("s02", 12, DRUNK, (17, 36), CARRIED, on_floor=False),
     "racquet_glide": Case("s03", 6, {"right_hand"}, (16, 37), SWUNG, **RACQUET),
     "stool_sit": Case(
-        "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
+        "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),)
     ),
     "football_kick": Case("s08", 5, {"right_foot"}, (13, 15), ((0.0, 1.55),)),
     "skateboard_ride": Case(
@@ -77,9 +73,7 @@ MORE_CASES = {
         "s08", 27, {"right_hand"}, (21, 37), ((0.0, 1.36), (2.53, 3.0)), on_floor=False
     ),
     "umbrella_turn": Case("s09", 26, {"right_hand"}, (16, 37), SWUNG, **UMBRELLA),
-    "chair_sit": Case(
-        "s10", 193616834, {"seat", "back", "right_hand"}, (22, 33), ((0.0, 3.0),), pressed_m=0.02
-    ),
+    "chair_sit": Case("s10", 193616834, {"seat", "back", "right_hand"}, (22, 33), ((0.0, 3.0),)),
     "toolbox_carry": Case("s02", 2, {"right_hand"}, (17, 36), CARRIED),
 }
 
@@ -135,18 +129,6 @@ def test_the_object_does_not_enter_the_body(played: Played) -> None:
         body = DistanceField(played.state.body[n], played.stage.subject.faces)
         placed = apply(played.state.stage_from_object[n], samples)
         assert -body.signed_distance(placed).min() < 0.015
-
-
-def test_penetration_before_deformation_is_limited(played: Played) -> None:
-    """Before the tissue gives way: millimetres at a hand, 15 to 20 mm on a seat."""
-    stage = played.stage
-    performed = stage.interaction.perform(np.arange(0.0, 3.0, 0.2))
-    skin = stage.puppet.skin(performed.world, performed.pelvis).vertices
-    deepest = min(
-        near_object(stage, points, pose).min(initial=0.0)
-        for points, pose in zip(skin, performed.script_from_object, strict=True)
-    )
-    assert -deepest < played.case.pressed_m
 
 
 def test_expected_regions_touch_all_the_time(played: Played) -> None:
@@ -209,27 +191,6 @@ def test_object_and_joints_move_without_a_jump(played: Played) -> None:
     joints = stage.puppet.skeleton.forward(performed.world, performed.pelvis)
     assert np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() / step < case.joint_m_s
     assert np.linalg.norm(np.diff(joints, 2, axis=0), axis=-1).max() / step**2 < case.joint_m_s2
-
-
-def test_a_kicked_ball_slides_then_rolls_then_stops() -> None:
-    case = CASES["football_kick"]
-    stage = make_stage("football_kick", case.subject, case.seed)
-    pose = stage.interaction.perform(np.arange(2.0, 3.0, 0.02)).script_from_object
-    speed = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1) / 0.02
-    between = np.swapaxes(pose[:-1, :3, :3], 1, 2) @ pose[1:, :3, :3]
-    spin = np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)) / 0.02
-    assert (np.diff(speed) < 1e-3).all()
-    assert speed[-1] == 0
-    rolls = speed > 0.1
-    np.testing.assert_allclose(spin[rolls] * 0.11, speed[rolls], rtol=0.02)
-
-
-def test_script_times_depend_on_the_recordings_length() -> None:
-    script = make_stage("beam_walk", "s03", 9001).interaction
-    speeds = [np.diff(script.script_times(np.array([0, 0.1]), s))[0] / 0.1 for s in (3.0, 6.0)]
-    assert speeds == pytest.approx([1.0, 0.5])
-    short = script.script_times(np.array([0.0, 0.2]), 0.2)
-    assert short[0] <= script.highlight <= short[1]
 
 
 # --- the beam ------------------------------------------------------------------------------------
@@ -295,14 +256,7 @@ class Held:
         return slip_speed(fitted, self.local, self.touching, normals_at, FPS)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        "racquet_glide",
-        pytest.param("umbrella_turn", marks=pytest.mark.full),
-        "bottle_regrasp",
-    ],
-)
+@pytest.fixture(scope="module", params=["racquet_glide", "bottle_regrasp"])
 def held(request: pytest.FixtureRequest) -> Held:
     case = (CASES | MORE_CASES)[request.param]
     stage = make_stage(request.param, case.subject, case.seed)
@@ -317,31 +271,19 @@ def held(request: pytest.FixtureRequest) -> Held:
     return Held(stage, state, local, distance)
 
 
-def test_a_slide_rotates_about_and_moves_along_its_axis() -> None:
-    moved = along_and_about(np.array([0.1]), np.array([np.pi / 2]), np.array([0.2, 0.0]))[0]
-    np.testing.assert_allclose(moved @ [0.2, 0.0, 0.3, 1], [0.2, 0.0, 0.4, 1], atol=1e-12)
-    np.testing.assert_allclose(moved @ [0.3, 0.0, 0.0, 1], [0.2, 0.1, 0.1, 1], atol=1e-12)
-
-
 def test_true_slip_has_the_scripted_speed(held: Held) -> None:
     script = held.stage.interaction
     slide = script.slide(held.stage.set_times)
-    if isinstance(script, GlidingSwing):
-        moved, limits, rtol, atol = slide[:, 2, 3], script.glide_s, 0.15, 0.005
-        assert moved.max() == pytest.approx(script.glide_m)
-    elif isinstance(script, TurningSwing):
-        turned = np.arccos(np.clip((np.trace(slide[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-        assert turned.max() == pytest.approx(np.radians(script.turn_deg))
-        # the handle is a round bar of 21.5 mm
-        moved, limits, rtol, atol = 0.0108 * turned, script.turn_s, 0.35, 0.006
-    else:
+    if not isinstance(script, GlidingSwing):
         pytest.skip("the hand lets go")
+    moved = slide[:, 2, 3]
+    assert moved.max() == pytest.approx(script.glide_m)
     slip, window = held.true_slip(), round(SLIP_S * FPS)
     intended = np.abs(moved[window:] - moved[:-window]) * FPS / window
-    for start, end in (limits[:2], limits[2:]):
+    for start, end in (script.glide_s[:2], script.glide_s[2:]):
         part = _sets_within(start, end)
         assert intended[part].max() > 0.02
-        np.testing.assert_allclose(slip[part], intended[part], rtol=rtol, atol=atol)
+        np.testing.assert_allclose(slip[part], intended[part], rtol=0.15, atol=0.005)
     assert np.nanmax(slip[_sets_within(2.05, 2.50)]) < 0.005
 
 

@@ -18,11 +18,9 @@ from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import Image
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.studio.capture import make_capture
 from intercap_core.studio.capture_folder import Aligner, Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.rig import StudioRig, build_rig
-from intercap_core.studio.stage import check_faults
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 
 FPS, SETS = 15, (0, 1, 4)
@@ -147,35 +145,6 @@ def test_a_calibration_of_another_resolution_is_refused(tmp_path: Path, layout: 
     images_of(tmp_path, layout, rig.claimed.names[1])
     with pytest.raises(UserError, match="resolution"):
         images_of(tmp_path, layout, rig.claimed.names[2])
-
-
-def test_a_plain_calibration_of_another_size_is_accepted(tmp_path: Path) -> None:
-    write(tmp_path, "plain", ("wrong_resolution",), {"wrong_resolution": 2})
-    widths = [images_of(tmp_path, "plain", name)[0].colour.width for name in ("k2", "k3")]
-    assert widths == [1280, 1920]
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_faults_of_other_layouts_are_refused(layout: LayoutName) -> None:
-    own = {"same_serial", "backwards_clock", "swapped_lenses", "wrong_resolution"}
-    for fault in sorted(own):
-        if fault in FOLDERS[layout].own_faults:
-            check_faults((fault,), layout=layout, cameras=6, frames=9)
-        else:
-            with pytest.raises(UserError, match=f"{layout!r} cannot have fault {fault}"):
-                check_faults((fault,), layout=layout, cameras=6, frames=9)
-
-
-def test_captures_without_depth_have_no_depth_files(tmp_path: Path) -> None:
-    make_capture(
-        StudioCapture(interaction="walk_and_wave", subject="s03", seed=5, frames=2, layout="plain",
-                      depth=False, room="bare"),
-        StudioSettings(captures={}, cameras=2, colour_mode="720P"),
-        sequence="flat", objects=None, output=tmp_path / "flat",
-    )  # fmt: skip
-    assert not list(tmp_path.rglob("*.png"))
-    camera, images = images_of(tmp_path / "flat", "plain", "k2")
-    assert camera.depth is None and {image.kind for image in images} == {"colour"}
 
 
 def test_aligned_depth_is_that_of_the_colour_camera():

@@ -47,21 +47,6 @@ def test_a_second_person_walks_past_without_contact(stage: StudioStage, walker: 
     assert pace.min() > 0.8 and pace.max() < 2.2
 
 
-def test_a_second_person_stands_and_watches() -> None:
-    stage = stage_with("stands")
-    times = np.arange(0, stage.duration, 1 / 15)
-    moment, passing = stage.at(times), stage.passer_by.at(times)
-    assert passing.present.all()
-    assert np.ptp(passing.joints[:, 0], axis=0).max() < 0.02  # sways, and does not walk
-    assert np.ptp(passing.joints[:, 0], axis=0).max() > 0
-    towards = (moment.joints - passing.joints)[:, 0, :2]
-    apart = np.linalg.norm(towards, axis=1)
-    assert PasserBy.passes_m[0] - 0.05 < apart.min() < PasserBy.passes_m[1] + 0.05
-    ahead = passing.pelvis[:, :2, 2]  # the pelvis' z looks ahead
-    assert ((ahead * towards).sum(1) / apart > 0.5).all()
-    assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
-
-
 def test_a_passer_by_leaves_the_recording_unchanged(stage: StudioStage) -> None:
     alone = stage_with("nobody")
     ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))

@@ -1,4 +1,4 @@
-"""People, their shoes, and the colours of objects."""
+"""People and their shoes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ from intercap_core.body.model import BodyModel
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.studio.stage import StudioStage
 from intercap_core.studio.subjects import (
-    FEET,
-    LEATHER_M,
     SOLE_M,
     Subject,
-    in_heavy_shoes,
-    shoe_area,
-    subject_names,
 )
 
 
@@ -60,25 +55,6 @@ def test_mapped_points_are_on_the_surface_and_on_the_same_limb(
     assert (np.abs(theirs[hands] - own[hands, None]).min(1) <= 2).mean() > 0.97
     assert mapped.shape == (body.num_vertices, 3)
     assert person.fitted_bary.min() >= 0
-
-
-@pytest.mark.parametrize("name", subject_names()[::3])
-def test_soles_are_flat_and_leather_has_its_thickness(name: str) -> None:
-    bare = Subject.load(name)
-    shod = in_heavy_shoes(bare, np.random.default_rng(3))
-    np.testing.assert_array_equal(shod.rest, bare.rest)
-    away = ~shoe_area(bare)
-    np.testing.assert_array_equal(shod.clothing[away], bare.clothing[away])
-    normals = bare.normals(bare.rest[None])[0]
-    for foot in FEET:
-        own = shoe_area(bare) & (np.asarray(bare.weights[:, foot].sum(1)).ravel() > 0.5)
-        ground = bare.rest[own, 1].min() - SOLE_M
-        assert shod.rest_clothed[own, 1].min() == pytest.approx(ground, abs=1e-4)
-        under = own & (normals[:, 1] < -0.9)
-        assert np.percentile(shod.rest_clothed[under, 1] - ground, 90) < 0.001
-        level = own & (np.abs(normals[:, 1]) < 0.2) & (bare.rest[:, 1] < ground + SOLE_M + 0.03)
-        thick = shod.clothing[level]
-        assert LEATHER_M[0] <= thick.min() and thick.max() <= LEATHER_M[1]
 
 
 def test_a_person_stands_on_the_soles() -> None:

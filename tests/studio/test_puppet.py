@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.interactions.grasps import Hollow
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT
@@ -29,17 +28,6 @@ def test_limb_reaches_its_target_and_bends_to_the_pole() -> None:
     across = pole - direction * (pole * direction).sum(1, keepdims=True)
     assert (((knee - root) * across).sum(1) > 0).all()
     np.testing.assert_allclose(np.linalg.det(upper), 1, atol=1e-9)
-
-
-@pytest.mark.parametrize("side", [0, 1])
-def test_fingers_flex_towards_the_palm(side: int) -> None:
-    hand = Hand(Subject.load("s04"), side)
-    fist = shape((60, 70, 40), (20, 20, 20), 40)
-    open_tips, fist_tips = (
-        hand.skin(hand.local(h)[None])[0][hand.moved[1][2]].mean(0) for h in (OPEN, fist)
-    )
-    assert (fist_tips - open_tips) @ hand.palm > 0.01
-    assert (fist_tips - open_tips) @ hand.out < -0.02
 
 
 @pytest.mark.parametrize("subject", ["s03", pytest.param("s06", marks=pytest.mark.full)])

@@ -1,4 +1,4 @@
-"""Sound of the studio's videos, and stated start times."""
+"""Sound of the studio's videos."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from scipy import signal
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.formats.recordings.sound_delays import sound_starts
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
-from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
 from intercap_core.studio.sensors import MAX_LATENCY_S, heard
 from intercap_core.studio.stage import StudioStage
@@ -45,17 +44,3 @@ def test_sound_yields_the_cameras_start_times(seed):
     assert np.isfinite(start).all() and (sigma < 0.035).all()
     assert np.abs(errors).max() < 2 * MAX_LATENCY_S + TRAVEL_S
     assert np.abs(errors[1:]).max() > 0.001  # microphones are no clocks
-
-
-def test_stated_starts_err_by_their_sigma():
-    stage = stage_of(7911)
-    exact = erring_starts(stage, 0.0)
-    assert exact["starts_sigma"] == 0.001
-    first = [min(set(range(90)) - lost) / 30 for lost in stage.rig.missing]
-    clock = np.array(list(exact["starts"].values())) - first + stage.rig.late_s
-    np.testing.assert_allclose(clock, clock[0], atol=2e-4)
-    off = [
-        np.subtract(*(list(erring_starts(stage_of(s), e)["starts"].values()) for e in (0.05, 0.0)))
-        for s in (1, 2, 3, 4)
-    ]
-    assert 0.025 < np.std(off) < 0.09
