@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from scipy.linalg import get_blas_funcs
 from torch import Tensor
 
 
@@ -37,6 +38,7 @@ class BandedSystem:
         if w1 == 1:
             lower[0], info = torch.linalg.cholesky_ex(lower[0])
             return None if bool(info.any()) else BandedFactor(lower)
+        (syrk,) = get_blas_funcs(("syrk",), dtype=lower.numpy().dtype)
         for t in range(count):
             # lower[k, t - k] is block (t, t - k); finish row t from its farthest column on
             for k in range(min(w1 - 1, t), 0, -1):
@@ -46,10 +48,12 @@ class BandedSystem:
                 lower[k, t - k] = torch.linalg.solve_triangular(
                     lower[0, t - k].T, block, upper=True, left=False
                 )
-            block = lower[0, t]
+            own = lower[0, t].numpy()
             for k in range(1, min(w1 - 1, t) + 1):
-                block -= lower[k, t - k] @ lower[k, t - k].T
-            lower[0, t], info = torch.linalg.cholesky_ex(block)
+                # only the lower triangle, which cholesky_ex reads; BLAS stores by columns
+                rows = lower[k, t - k].numpy()
+                own = syrk(-1.0, rows.T, beta=1.0, c=own.T, trans=1, overwrite_c=1).T
+            lower[0, t], info = torch.linalg.cholesky_ex(torch.from_numpy(own))
             if bool(info):
                 return None
         return BandedFactor(lower)
