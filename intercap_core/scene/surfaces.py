@@ -83,7 +83,7 @@ class NearestPoints:
     def query(self, sought: np.ndarray, layer: np.ndarray | int) -> np.ndarray:
         """Index (M,) of the point nearest to each of ``sought`` (M, 3), metres; -1 = none.
 
-        ``layer``: (M,) layer of each, or one number for all.
+        ``layer``: (M,) layer of each, or one number for all; a layer may have no points.
         """
         scaled = (sought - self._low) / self._radius_m
         layer = np.zeros(len(sought), np.int64) + layer
@@ -113,10 +113,12 @@ def _nearest(
         x, y, z = sought[i, 0], sought[i, 1], sought[i, 2]
         own_x, own_y, own_z = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
         first, end = max(own_z - 1, 0), min(own_z + 2, shape[3])
+        if first >= end or not 0 <= layer[i] < shape[0]:
+            continue
         best = 1.0
         for u in (own_x, own_x - 1, own_x + 1):
             for v in (own_y, own_y - 1, own_y + 1):
-                if first >= end or not (0 <= u < shape[1] and 0 <= v < shape[2]):
+                if not (0 <= u < shape[1] and 0 <= v < shape[2]):
                     continue
                 gap_x, gap_y = max(u - x, x - u - 1, 0.0), max(v - y, y - v - 1, 0.0)
                 if gap_x * gap_x + gap_y * gap_y >= best:

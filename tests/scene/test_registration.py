@@ -127,7 +127,7 @@ def test_normals_are_cross_products_of_central_differences():
 def test_nearest_points_are_those_of_all_pairs():
     rng = np.random.default_rng(0)
     points, sought = rng.uniform(-1, 1, (400, 3)), rng.uniform(-1.5, 1.5, (300, 3))
-    layer, own = rng.integers(0, 3, len(points)), rng.integers(0, 3, len(sought))
+    layer, own = rng.integers(0, 3, len(points)), rng.integers(-1, 5, len(sought))
     away = np.linalg.norm(sought[:, None] - points, axis=-1)
     away[own[:, None] != layer] = np.inf
     expected = np.where(away.min(1) < 0.3, away.argmin(1), -1)
