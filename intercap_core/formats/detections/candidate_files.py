@@ -43,7 +43,6 @@ from intercap_core.formats.detections.mask_files import (
     MaskFile,
     find_instance_masks,
     find_release_masks,
-    is_mask,
     read_masks,
 )
 from intercap_core.formats.recordings.image_files import DamagedImage
@@ -94,7 +93,7 @@ def holds_instances(folder: Path, camera: str, layout: str) -> bool:
     """Whether the first file of a camera lists results of instance segmentation, or is a mask."""
     path = camera_file(folder, camera) or next(iter(image_files(folder, camera)), None)
     if path is None:
-        return any(is_mask(mask) for mask in candidate_paths(folder, camera, layout)[:1])
+        return has_candidates(folder, camera, layout)
     try:
         content = read_first(path)
         return bool(parse_candidates(content, CandidateForm((1, 1), {}, 0.0)).entries)
