@@ -74,6 +74,13 @@ def test_cameras_poses_and_gravity(capture):
         assert np.allclose(frames.gravity, down[None], atol=1e-6)
 
 
+def test_degraded_cameras_are_noted(capture):
+    notes = notes_of(run(capture))
+    assert notes["k1"] == ""
+    assert "no image in 1 frame sets" in notes["k2"]
+    assert "ends 1 frame sets early" in notes["k3"]
+
+
 def test_dropped_sets_have_no_image(capture):
     with Frames.open(run(capture, drop=(1, 4))) as frames:
         assert not frames.available[[1, 4]].any() and frames.available[[0, 2, 3, 5]].any(1).all()

@@ -15,7 +15,6 @@ from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.rig import StudioRig, build_rig, started_apart
-from intercap_core.studio.sensors import LargeErrors
 from intercap_core.studio.stage import check_capture
 from tests.helpers.fitted_capture import object_entry
 
@@ -62,12 +61,6 @@ def test_late_starts_are_whole_sets_plus_a_fraction(fps: int) -> None:
     assert late[0, 0] == 0 and 0.45 <= np.abs(late[0]).max() <= 0.5
     assert np.abs(apart.offset_s - rig.offset_s).max() <= 0.5 / fps + 1e-12
     assert len(np.unique(late[0])) == len(late[0])
-
-
-def test_depth_errors_grow_with_distance_and_incidence() -> None:
-    errors = LargeErrors(bias_m=0.004, slope=0.001)
-    depth, cosine = np.array([2.5, 3.5, 2.5]), np.array([-1.0, 1.0, 0.5])
-    np.testing.assert_allclose(errors.at(depth, cosine), [0.004, 0.005, 0.008])
 
 
 @pytest.fixture(scope="module")

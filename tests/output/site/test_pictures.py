@@ -101,13 +101,6 @@ def test_frames_are_spread_and_hold_the_worst() -> None:
     assert overlays.choose_frames(residual[:3], 4) == [0, 1, 2]
 
 
-def test_heat_colours_run_from_grey_to_dark_red() -> None:
-    colours = heat_pictures.colours(np.array([0, 0.25, 1.0, 7.0]), 1.0)
-    assert colours[0] == pytest.approx(heat_pictures.COLOUR_STOPS[0])
-    assert colours[1] == pytest.approx(heat_pictures.COLOUR_STOPS[1])
-    assert colours[2:] == pytest.approx(np.tile(heat_pictures.COLOUR_STOPS[-1], (2, 1)))
-
-
 def test_object_heat_shows_on_the_side_that_is_touched() -> None:
     ball = trimesh.creation.icosphere(2, 0.1)
     points = trimesh.creation.icosphere(4, 0.1).vertices
