@@ -80,10 +80,12 @@ SLOW = (
 # Folders and files of the second tier, `make test-all`.
 FULL = (
     "annotate/browser",
+    "joint/test_extending.py",
     "output/site/test_site_in_a_browser.py",
     "output/viewer/test_browser.py",
     "slurm/test_faults.py",
     "slurm/test_short.py",
+    "workflow/test_extending.py",
     "workflow/test_identity.py",
     "workflow/test_outputs.py",
 )

@@ -105,7 +105,10 @@ def people(model: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> People
         pytest.param(Reduction(cameras=["k1", "k3"]), 25, id="two", marks=FULL),
         pytest.param(Reduction(cameras=["k1"]), 60, id="one"),
         pytest.param(
-            Reduction(cameras=["k1", "k4", "k5"], images_until={"k1": 1}), 25, id="one stops"
+            Reduction(cameras=["k1", "k4", "k5"], images_until={"k1": 1}),
+            25,
+            id="one stops",
+            marks=FULL,
         ),
         pytest.param(Reduction(keypoints=["k1", "k3"]), 25, id="keypoints in two", marks=FULL),
     ],
@@ -190,7 +193,9 @@ def tracked(paths: dict[str, Path], output: Path, name: str = "suitcase") -> Pat
         pytest.param(
             "football", Reduction(cameras=["k1", "k2"], depth=[]), 15, id="two without depth"
         ),
-        pytest.param("football", Reduction(images_until={"k1": 1, "k3": 1}), 6, id="two stop"),
+        pytest.param(
+            "football", Reduction(images_until={"k1": 1, "k3": 1}), 6, id="two stop", marks=FULL
+        ),
         pytest.param("football", Reduction(candidates=["k1", "k3"]), 6, id="few candidates"),
     ],
 )
