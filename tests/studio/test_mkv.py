@@ -95,21 +95,6 @@ def test_tags_attachment_and_rates(tmp_path):
         assert container.duration == last_imu_us
 
 
-def test_invalid_calls_are_refused(tmp_path):
-    jpegs, depths = make_images()
-    options = dict(calibration_json=b"{}", colour_mode="720P", fps=30, serial="1")
-    with MkvWriter(tmp_path / "a.mkv", depth_mode="NFOV_UNBINNED", **options) as writer:
-        with pytest.raises(ValueError, match="expected"):
-            writer.write_depth(depths[0], 0)
-        with pytest.raises(ValueError, match="without IR track"):
-            writer.write_ir(depths[0], 0)
-        writer.write_colour(jpegs[0], 1_000_000)
-        with pytest.raises(ValueError, match="far before"):
-            writer.write_depth(np.zeros((576, 640), np.uint16), 0)
-    with pytest.raises(ValueError, match="fps is 25"):
-        MkvWriter(tmp_path / "b.mkv", depth_mode=None, **(options | {"fps": 25}))
-
-
 @pytest.mark.parametrize(("colour_mode", "depth_mode"), zip(COLOUR_MODES, cycle(DEPTH_MODES)))
 def test_calibration_round_trip_in_every_mode(colour_mode, depth_mode):
     rng = np.random.default_rng(1)
