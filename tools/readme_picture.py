@@ -20,11 +20,10 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.output.site.closeups import Column, read_handling
-from intercap_core.output.site.drawing import put_text
+from intercap_core.output.site.drawing import ColouredMesh, put_text
 from intercap_core.output.site.overlays import (
     BODY_COLOUR,
     OBJECT_COLOUR,
-    PosedMesh,
     choose_cameras,
     draw_over,
 )
@@ -82,12 +81,12 @@ class Posed:
     column: Column
     faces: np.ndarray
 
-    def at(self, t: int) -> list[PosedMesh]:
+    def at(self, t: int) -> list[ColouredMesh]:
         """Body and object in a frame."""
         pair = self.column.at(t)
         return [
-            PosedMesh(pair.body, self.faces, np.eye(4), BODY_COLOUR),
-            PosedMesh(pair.vertices, pair.faces, np.eye(4), OBJECT_COLOUR),
+            ColouredMesh(pair.body, self.faces, np.eye(4), colours=BODY_COLOUR),
+            ColouredMesh(pair.vertices, pair.faces, np.eye(4), colours=OBJECT_COLOUR),
         ]
 
 

@@ -42,6 +42,6 @@ def draw_closeups(
         for hold in contacts:
             path = folder / f"{name}_{hold.side}_{hold.first:04d}-{hold.last:04d}.jpg"
             folder.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(closeup(handling, hold).data)
+            path.write_bytes(closeup(handling, hold).content)
             written.append(path)
     return written, empty

@@ -28,7 +28,6 @@ from intercap_core.output.site.capture_section import read_capture
 from intercap_core.output.site.closeups import closeup, holds, read_handling
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.overlays import (
-    Overlay,
     PosedFit,
     choose_cameras,
     choose_frames,
@@ -73,7 +72,7 @@ def run(
         description, energies = _describe_joint(fit, rig, master), _energies(fit)
         rig = rig.moved(fit["master_from_colour"])
     note, preview = "", None
-    drawn: list[Overlay] = []
+    drawn: dict[str, dict[int, EncodedImage]] = {}
     try:
         drawn, preview = _overlays(paths.frames, measured, posed, rig, image_of, settings)
     except UserError as error:  # a page without overlays is better than none
@@ -98,7 +97,7 @@ def run(
     output.mkdir(parents=True)
     (output / "index.html").write_text(page(content), encoding="utf-8")
     if preview is not None:
-        (output / PREVIEW).write_bytes(preview.thumbnail.data)
+        (output / PREVIEW).write_bytes(preview.thumbnail.content)
     viewer.write_script(output / viewer.SCRIPT, paths, shown, truth=truth)
 
 
@@ -109,7 +108,7 @@ def _overlays(
     rig: Rig,
     image_of: np.ndarray,
     settings: PageSettings,
-) -> tuple[list[Overlay], Preview | None]:
+) -> tuple[dict[str, dict[int, EncodedImage]], Preview | None]:
     """Overlays of body and object on the images of some frames and cameras, and a preview.
 
     Frames are evenly spread, and include the one in which the meshes are farthest from the measured

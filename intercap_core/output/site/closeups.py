@@ -33,8 +33,10 @@ from intercap_core.output.site.drawing import (
     EncodedImage,
     draw,
     encode_jpeg,
+    look_along,
     put_text,
 )
+from intercap_core.output.site.embed import span
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.schemas import CONTACT_M, JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -132,8 +134,8 @@ class Hold:
     @property
     def caption(self) -> str:
         """Caption of a picture."""
-        span = f"{self.first}–{self.last}" if self.last > self.first else f"{self.first}"
-        return f"{self.side} hand, frames {span}, drawn at {self.frame}"
+        frames = span(self.first, self.last)
+        return f"{self.side} hand, frames {frames}, drawn at {self.frame}"
 
 
 def read_handling(paths: SequencePaths, models: SequenceModels, *, truth: Path | None) -> Handling:
@@ -205,9 +207,13 @@ def closeup(handling: Handling, hold: Hold) -> EncodedImage:
     sheet = np.full((head + len(views) * step - gap, len(pairs) * step - gap, 3), 225, np.uint8)
     white = np.ones((_CELL_PX, _CELL_PX, 3), np.float32)
     for c, (column, pair) in enumerate(zip(handling.columns, pairs, strict=True)):
-        colours = _skin_colours(pair, model)
+        # skin that touches the object, or is inside it, is red
+        touching = pair.touching(model.faces.numpy())[:, None]
+        skin = np.where(touching, TOUCHING_COLOUR, BODY_COLOUR)
         for row, view in enumerate(views):
-            picture = draw(_coloured(pair, arms, colours, view), _lens(_CELL_PX))
+            body = ColouredMesh(pair.body, arms, view, colours=skin)
+            object_ = ColouredMesh(pair.vertices, pair.faces, view, colours=OBJECT_COLOUR)
+            picture = draw([body, object_], _lens(_CELL_PX))
             y, x = head + row * step, c * step
             sheet[y : y + _CELL_PX, x : x + _CELL_PX] = np.rint(255 * picture.over(white))
         label = column.name
@@ -249,7 +255,8 @@ def _viewpoints(
     showing = near[arms].any(1)  # by face
     lens, candidates = _lens(48), []
     for direction in _directions(up):
-        pose = _look_at(target, direction, up)
+        turn = look_along(direction, up)
+        pose = rigid(turn, turn @ (direction * _DISTANCE_M - target))
         drawn = render_scene(
             [Drawable(fitted.body, arms, pose), Drawable(fitted.vertices, fitted.faces, pose)], lens
         )
@@ -276,29 +283,4 @@ def _directions(up: np.ndarray) -> list[np.ndarray]:
         -np.sqrt(1 - rise**2) * (np.cos(turn) * side + np.sin(turn) * front) - rise * up
         for rise in (-0.3, 0.1, 0.45, 0.8)
         for turn in np.arange(12) * np.pi / 6
-    ]
-
-
-def _look_at(target: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return camera_from_master (4, 4) of a camera that looks along ``direction`` at ``target``."""
-    right = np.cross(direction, up)
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, np.cross(direction, right), direction])
-    return rigid(turn, turn @ (direction * _DISTANCE_M - target))
-
-
-def _skin_colours(pair: PosedPair, model: BodyModel) -> np.ndarray:
-    """Return colours (V, 3). Skin that touches the object, or is inside it, is red."""
-    colours = np.tile(BODY_COLOUR, (len(pair.body), 1))
-    colours[pair.touching(model.faces.numpy())] = TOUCHING_COLOUR
-    return colours
-
-
-def _coloured(
-    pair: PosedPair, arms: np.ndarray, colours: np.ndarray, view: np.ndarray
-) -> list[ColouredMesh]:
-    object_colours = np.tile(OBJECT_COLOUR, (len(pair.vertices), 1))
-    return [
-        ColouredMesh(pair.body, arms, colours, view),
-        ColouredMesh(pair.vertices, pair.faces, object_colours, view),
     ]

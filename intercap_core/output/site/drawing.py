@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
 import numpy as np
+import trimesh
 from PIL import Image
 
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.rigid.surfaces import vertex_normals
@@ -23,7 +26,7 @@ from intercap_core.geometry.rigid.surfaces import vertex_normals
 class EncodedImage:
     """A compressed image for a page."""
 
-    data: bytes
+    content: bytes
     """Content of the image file."""
     kind: Literal["jpeg", "png", "webp"]
     width: int
@@ -31,19 +34,23 @@ class EncodedImage:
     caption: str = ""
     """Caption on the page, "" for none."""
 
+    @property
+    def data(self) -> str:
+        """The image as the part of a data URL after ``data:``, as templates print it."""
+        return f"image/{self.kind};base64,{base64.b64encode(self.content).decode()}"
 
-@dataclass(frozen=True, eq=False)
-class ColouredMesh:
-    """A mesh with a colour per vertex."""
 
-    vertices: np.ndarray
-    """(V, 3) in the mesh's frame."""
-    faces: np.ndarray
-    """(F, 3)"""
-    colours: np.ndarray
-    """(V, 3) RGB in 0..1."""
-    camera_from_mesh: np.ndarray
-    """(4, 4)"""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ColouredMesh(Drawable):
+    """A mesh with its pose and a colour."""
+
+    colours: np.ndarray | tuple[float, ...]
+    """RGB in 0..1: (V, 3) by vertex, or (3,) for all."""
+
+    def seen_by(self, camera: Camera) -> ColouredMesh:
+        """Return the mesh in the frame of a camera; ``self`` is in the master camera's frame."""
+        pose = camera.colour_from_master @ self.camera_from_mesh
+        return replace(self, camera_from_mesh=pose)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +70,7 @@ class RenderedImage:
 def draw(meshes: Sequence[ColouredMesh], lens: Intrinsics) -> RenderedImage:
     """Render meshes with mutual occlusion into the whole image of ``lens``."""
     fine = lens.scaled(2)  # supersampling
-    rendering = render_scene(
-        [Drawable(m.vertices, m.faces, m.camera_from_mesh) for m in meshes], fine
-    )
+    rendering = render_scene(meshes, fine)
     large = np.zeros((fine.height, fine.width, 4), np.float32)
     if rendering.depth.size:
         large[rendering.window] = _shade(meshes, rendering, fine)
@@ -87,34 +92,34 @@ def _shade(meshes: Sequence[ColouredMesh], rendering: Rendering, lens: Intrinsic
         rows, columns = np.nonzero(rendering.body == number)
         if len(rows) == 0:
             continue
-        pose = mesh.camera_from_mesh
-        vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        vertices = apply(mesh.camera_from_mesh, mesh.vertices)
         corners = mesh.faces[rendering.face[rows, columns]]
         depth = rendering.depth[rows, columns, None]
         points = np.concatenate([rays[rows, columns] * depth, depth], 1)
-        weights = _barycentric(points, *(vertices[corners[:, k]] for k in range(3)))
+        weights = trimesh.triangles.points_to_barycentric(vertices[corners], points, "cross")
+        weights = np.clip(weights, 0, 1)
         normals = _mix(vertex_normals(vertices, mesh.faces), corners, weights)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         lit = ambient + (1 - ambient) * np.clip(normals @ light, 0, 1)
-        colours = _mix(mesh.colours, corners, weights) * lit[:, None]
-        result[rows, columns, :3] = colours
+        colours = np.broadcast_to(mesh.colours, vertices.shape)
+        result[rows, columns, :3] = _mix(colours, corners, weights) * lit[:, None]
         result[rows, columns, 3] = 1
     return result
-
-
-def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return barycentric weights (N, 3) of points p (N, 3) on triangles a, b, c (N, 3)."""
-    normal = np.cross(b - a, c - a)
-    scale = np.maximum((normal * normal).sum(1), 1e-20)
-    of_b = (np.cross(p - a, c - a) * normal).sum(1) / scale
-    of_c = (np.cross(b - a, p - a) * normal).sum(1) / scale
-    weights = np.column_stack([1 - of_b - of_c, of_b, of_c])
-    return np.clip(weights, 0, 1)
 
 
 def _mix(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Interpolate values (V, 3) of vertices: ``corners`` (N, 3) indices, ``weights`` (N, 3)."""
     return sum(values[corners[:, k]] * weights[:, k, None] for k in range(3))
+
+
+def look_along(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) to the frame of a camera that looks along a unit ``direction``.
+
+    The camera is held upright: x right, y down, z forward.
+    """
+    right = np.cross(direction, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(direction, right), direction])
 
 
 def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
@@ -125,7 +130,7 @@ def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
     return EncodedImage(data, "jpeg", bgr.shape[1], bgr.shape[0], caption)
 
 
-def encode_animation(pictures: Sequence[np.ndarray], seconds: float) -> EncodedImage:
+def encode_animation(pictures: Sequence[np.ndarray], seconds: float, caption: str) -> EncodedImage:
     """Encode images (H, W, 3) in 0..1 as an endless animated WebP of ``seconds`` per round."""
     images = [
         Image.fromarray(np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)) for rgb in pictures
@@ -135,7 +140,7 @@ def encode_animation(pictures: Sequence[np.ndarray], seconds: float) -> EncodedI
         stream, "WEBP", save_all=True, append_images=images[1:], loop=0, quality=60, method=4,
         duration=max(1, round(1e3 * seconds / len(images))),
     )  # fmt: skip
-    return EncodedImage(stream.getvalue(), "webp", images[0].width, images[0].height)
+    return EncodedImage(stream.getvalue(), "webp", images[0].width, images[0].height, caption)
 
 
 def encode_png(picture: RenderedImage, caption: str = "") -> EncodedImage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 from markupsafe import Markup
 
 from intercap_core.flags import OF_OBJECT, PARTS, Flags
-from intercap_core.output.site.drawing import EncodedImage
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _POLICY = (  # a page may load nothing but itself and pictures of the site
@@ -35,16 +33,6 @@ def render(template: str, context: Mapping[str, Any]) -> str:
         "script": Markup((_TEMPLATES / "script.js").read_text(encoding="utf-8")),
     }
     return environment.get_template(template).render({**shared, **context})
-
-
-def embedded(image: EncodedImage, caption: str | None = None) -> dict[str, Any]:
-    """Return an image as templates print it, by default with its own caption."""
-    return {
-        "data": f"image/{image.kind};base64,{base64.b64encode(image.data).decode()}",
-        "width": image.width,
-        "height": image.height,
-        "caption": image.caption if caption is None else caption,
-    }
 
 
 def css(colour: Sequence[float]) -> str:

@@ -12,7 +12,13 @@ from intercap_core.body.model import BodyModel
 from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_png
+from intercap_core.output.site.drawing import (
+    ColouredMesh,
+    EncodedImage,
+    draw,
+    encode_png,
+    look_along,
+)
 
 # sRGB, from no contact to the map's maximum: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
@@ -109,9 +115,7 @@ def _draw_from(
     """Draw the faces from far away; they fill a picture of ``size`` (width, height)."""
     backward = np.asarray(towards_viewer, np.float64)
     backward = backward / np.linalg.norm(backward)
-    right = np.cross(up, backward)
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, -np.cross(backward, right), -backward])  # x right, y down, z forward
+    turn = look_along(-backward, up)
     used = vertices[np.unique(faces)] @ turn.T
     low, high = used.min(0), used.max(0)
     middle, extent = (low + high) / 2, (high - low)[:2]
@@ -119,5 +123,5 @@ def _draw_from(
     focal = 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1])
     lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
     pose = rigid(turn, np.array([0, 0, distance]) - middle)
-    picture = draw([ColouredMesh(vertices, faces, paint, pose)], lens)
+    picture = draw([ColouredMesh(vertices, faces, pose, colours=paint)], lens)
     return encode_png(picture, caption)

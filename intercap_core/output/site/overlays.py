@@ -16,20 +16,10 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
-from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_jpeg
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)
-
-
-@dataclass(frozen=True, eq=False)
-class Overlay:
-    """A recorded image with the fit drawn over it."""
-
-    camera: str
-    frame: int
-    image: EncodedImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,30 +35,18 @@ class PosedFit:
     mesh: ObjectMesh | None
     """None without an object."""
 
-    def at(self, t: int) -> list[PosedMesh]:
-        """Return body and, if there is one, object in a frame."""
+    def at(self, t: int) -> list[ColouredMesh]:
+        """Return body and, if there is one, object in a frame, in the master camera's frame."""
         with torch.no_grad():
             posed = self.model.forward(self.parameters.frames(slice(t, t + 1)))
         body = posed.vertices[0].numpy().astype(np.float64)
-        meshes = [PosedMesh(body, self.model.faces.numpy(), np.eye(4), BODY_COLOUR)]
+        faces = self.model.faces.numpy()
+        meshes = [ColouredMesh(body, faces, np.eye(4), colours=BODY_COLOUR)]
         if self.mesh is not None:
             pose = rigid(self.rotation[t], self.translation[t])
-            meshes.append(PosedMesh(self.mesh.vertices, self.mesh.faces, pose, OBJECT_COLOUR))
+            mesh = self.mesh
+            meshes.append(ColouredMesh(mesh.vertices, mesh.faces, pose, colours=OBJECT_COLOUR))
         return meshes
-
-
-@dataclass(frozen=True, eq=False)
-class PosedMesh:
-    """A mesh with a pose and a colour."""
-
-    vertices: np.ndarray
-    """(V, 3)"""
-    faces: np.ndarray
-    """(F, 3)"""
-    master_from_mesh: np.ndarray
-    """(4, 4)"""
-    colour: tuple[float, ...]
-    """RGB in 0..1."""
 
 
 def choose_frames(residual: np.ndarray, count: int) -> list[int]:
@@ -100,11 +78,7 @@ def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -
     for c, camera in enumerate(rig):
         lens = camera.colour.scaled(0.15)  # small images suffice to count pixels
         for meshes in posed:
-            drawables = [
-                Drawable(m.vertices, m.faces, camera.colour_from_master @ m.master_from_mesh)
-                for m in meshes
-            ]
-            rendering = render_scene(drawables, lens)
+            rendering = render_scene([mesh.seen_by(camera) for mesh in meshes], lens)
             seen[c] += np.count_nonzero(rendering.body == 1)
             seen[c] += 1e-3 * np.count_nonzero(rendering.body == 0)
     axes = rig.master_from_colour[:, :3, 2]
@@ -120,25 +94,26 @@ def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -
 
 def overlays(
     images: Frames, rig: Rig, fit: PosedFit, cameras: Sequence[int], frames: Sequence[int]
-) -> list[Overlay]:
-    """Draw the fit over images, in the order of cameras, then frames; skip missing images.
+) -> dict[str, dict[int, EncodedImage]]:
+    """Draw the fit over images; return them by name of the camera and frame, without missing ones.
 
     Args:
         images: images by the frame that they show (:meth:`Frames.showing`).
     """
     posed = {t: fit.at(t) for t in frames}
-    return [
-        Overlay(rig[c].name, t, encode_jpeg(picture))
-        for c in cameras
-        for t, picture in draw_over(images, rig, c, posed, rows=420).items()
-    ]
+    drawn = {rig[c].name: draw_over(images, rig, c, posed, rows=420) for c in cameras}
+    return {
+        camera: {t: encode_jpeg(picture) for t, picture in pictures.items()}
+        for camera, pictures in drawn.items()
+        if pictures
+    }
 
 
 def draw_over(
     images: Frames,
     rig: Rig,
     c: int,
-    posed: Mapping[int, Sequence[PosedMesh]],
+    posed: Mapping[int, Sequence[ColouredMesh]],
     *,
     rows: int,
     opacity: float = 0.62,
@@ -167,27 +142,18 @@ def draw_over(
             continue
         crop = image[y0 : y0 + height, x0 : x0 + width]
         crop = cv2.resize(crop, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        coloured = [
-            ColouredMesh(
-                m.vertices,
-                m.faces,
-                np.broadcast_to(np.array(m.colour), m.vertices.shape),
-                camera.colour_from_master @ m.master_from_mesh,
-            )
-            for m in meshes
-        ]
-        picture = draw(coloured, lens)
+        picture = draw([mesh.seen_by(camera) for mesh in meshes], lens)
         pictures[t] = picture.over(crop[..., ::-1] / np.float32(255), opacity)
     return pictures
 
 
-def _window(camera: Camera, meshes: Sequence[PosedMesh]) -> tuple[int, int, int, int] | None:
+def _window(camera: Camera, meshes: Sequence[ColouredMesh]) -> tuple[int, int, int, int] | None:
     """Return x, y, width, height of the part of the image that shows all meshes with a margin.
 
     None if they are not in view.
     """
-    lens, pose = camera.colour, camera.colour_from_master
-    points = np.concatenate([apply(pose @ m.master_from_mesh, m.vertices) for m in meshes])
+    lens, seen = camera.colour, [mesh.seen_by(camera) for mesh in meshes]
+    points = np.concatenate([apply(mesh.camera_from_mesh, mesh.vertices) for mesh in seen])
     points = points[lens.inside_model(points)]
     if len(points) == 0:
         return None

@@ -16,7 +16,7 @@ from intercap_core.evaluation.verdict.figures import mean_stated
 from intercap_core.flags import PARTS
 from intercap_core.output.site import measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, embedded, flag_tile, render, span, tile
+from intercap_core.output.site.embed import css, flag_tile, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
 from intercap_core.output.site.preview import PREVIEW
 from intercap_core.versions import versions
@@ -283,17 +283,8 @@ def _heat(content: DatasetContent) -> dict[str, Any]:
         "gradient": f"linear-gradient(90deg, {stops})",
         "body_frames": content.body_frames,
         "common": content.common_scale,
-        "surfaces": [_surface(heat) for heat in content.surfaces],
-        "objects": [_surface(heat) for heat in content.objects],
-    }
-
-
-def _surface(heat: Heat) -> dict[str, Any]:
-    return {
-        "name": heat.name,
-        "top": heat.top,
-        "frames": heat.frames,
-        "pictures": [embedded(picture) for picture in heat.pictures],
+        "surfaces": list(content.surfaces),
+        "objects": list(content.objects),
     }
 
 

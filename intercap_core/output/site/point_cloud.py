@@ -11,7 +11,8 @@ import numpy as np
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.clouds import colour_lookup
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.transforms import apply, rigid
+from intercap_core.output.site.drawing import look_along
 
 _BEHIND_M = 0.03  # a pixel covers neighbours that are more than this farther away
 # Row and column offsets of a pixel's neighbours
@@ -80,12 +81,8 @@ class Viewpoint:
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
              np.sin(elevation)]
         )  # fmt: skip
-        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        rotation = np.stack([right, -np.cross(away, right), -away])
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ (target + distance * away)
-        return cls(pose, focal, *size)
+        turn = look_along(-away, np.array([0.0, 0.0, 1.0]))
+        return cls(rigid(turn, -turn @ (target + distance * away)), focal, *size)
 
     @property
     def eye(self) -> np.ndarray:

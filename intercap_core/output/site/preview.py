@@ -27,8 +27,6 @@ class Preview:
     """A frame of it, for readers who prefer no motion."""
     thumbnail: EncodedImage
     """The same frame, small, cropped to body and object."""
-    camera: str
-    """Name of the camera."""
 
 
 def middle_of_contact(measured: SequenceMetrics) -> int:
@@ -57,9 +55,9 @@ def make_preview(
         return None
     nearest = min(pictures, key=lambda t: abs(t - middle))
     small = draw_over(images, rig, c, {nearest: fit.at(nearest)}, rows=_THUMBNAIL_ROWS)
+    caption = f"Result over the images of camera {rig.names[c]}"
     return Preview(
-        encode_animation(list(pictures.values()), total / measured.fps),
+        encode_animation(list(pictures.values()), total / measured.fps, caption),
         encode_jpeg(pictures[nearest]),
         encode_jpeg(small[nearest]),
-        rig.names[c],
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, embedded, flag_tile, render, span, tile
-from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.output.site.embed import css, flag_tile, render, span, tile
+from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.output.site.preview import Preview
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import METRIC_REGIONS
@@ -31,8 +31,8 @@ class SequenceContent:
     metrics: SequenceMetrics
     intent: str
     """Instruction to the person, "" if not stated."""
-    overlays: Sequence[Overlay]
-    """In the order of cameras."""
+    overlays: Mapping[str, Mapping[int, EncodedImage]]
+    """Fit over the images, by camera and frame."""
     preview: Preview | None
     """Animation at the top of the page; None without images."""
     note: str
@@ -60,12 +60,17 @@ def page(content: SequenceContent) -> str:
     """Return the HTML of the page."""
     s = content.metrics
     flagged = s.flags.texts()
-    cameras: dict[str, list[dict[str, Any]]] = {}
-    for overlay in content.overlays:
-        caption = f"camera {overlay.camera}, frame {overlay.frame}"
-        if why := flagged[overlay.frame]:
-            caption += f", not reliable: {why}"
-        cameras.setdefault(overlay.camera, []).append(embedded(overlay.image, caption))
+    cameras = [
+        [
+            replace(
+                picture,
+                caption=f"camera {camera}, frame {t}"
+                + (f", not reliable: {flagged[t]}" if flagged[t] else ""),
+            )
+            for t, picture in pictures.items()
+        ]
+        for camera, pictures in content.overlays.items()
+    ]
     context = {
         "name": s.name,
         "subject": s.subject,
@@ -86,14 +91,13 @@ def page(content: SequenceContent) -> str:
         "flagged_text": s.flags.summary(),
         "energies": _energies(content.energies),
         "joint": content.joint,
-        "cameras": list(cameras.values()),
+        "cameras": cameras,
         "note": content.note,
-        "preview": _preview(content.preview),
-        "closeups": [embedded(picture) for picture in content.closeups],
-        "capture": content.capture
-        | {"pictures": [[embedded(p) for p in row] for row in content.capture["pictures"]]},
-        "track": None if content.track is None else _with_sheet(content.track),
-        "body": _with_sheet(content.body),
+        "preview": content.preview,
+        "closeups": content.closeups,
+        "capture": content.capture,
+        "track": content.track,
+        "body": content.body,
         "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
@@ -102,16 +106,6 @@ def page(content: SequenceContent) -> str:
         "viewer": {"element": Markup(viewer.element()), "load": Markup(viewer.load())},
     }
     return render("sequence.html.j2", context)
-
-
-def _preview(preview: Preview | None) -> dict[str, Any] | None:
-    if preview is None:
-        return None
-    caption = f"Result over the images of camera {preview.camera}"
-    return {
-        "animation": embedded(preview.animation, caption),
-        "still": embedded(preview.still, caption),
-    }
 
 
 def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
@@ -268,12 +262,6 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
         ],
         "% of the energy at the start",
     )
-
-
-def _with_sheet(variables: dict[str, Any]) -> dict[str, Any]:
-    """Embed the sheet of a section, if it has one."""
-    sheet = variables["sheet"]
-    return variables | {"sheet": None if sheet is None else embedded(sheet)}
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str, str]]:

@@ -65,7 +65,7 @@ def test_another_body_file_is_refused(made: fitted.Capture, tmp_path: Path) -> N
 def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:
     sheet = _section(made)["sheet"]
     assert sheet is not None and ", 1, " in sheet.caption  # the frame with the largest deviation
-    bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(np.frombuffer(sheet.content, np.uint8), cv2.IMREAD_COLOR)
     assert bgr.shape == (sheet.height, sheet.width, 3)
     first, *others = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
     assert all((np.abs(c - FIT_COLOUR).max(-1) < 70).sum() > 100 for c in (first, *others))
@@ -89,7 +89,7 @@ def test_a_body_that_no_camera_sees_is_not_drawn(made: fitted.Capture, tmp_path:
         fit["transl"][:, 1] += 50.0  # far under the floor
     sheet = _section(sunk)["sheet"]
     assert sheet is not None
-    bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(np.frombuffer(sheet.content, np.uint8), cv2.IMREAD_COLOR)
     assert (np.abs(bgr[..., ::-1].astype(int) - FIT_COLOUR).max(-1) < 70).sum() < 50
 
 

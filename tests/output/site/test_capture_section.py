@@ -34,7 +34,7 @@ def facts(made: fitted.Capture) -> dict[str, Any]:
 
 
 def _decoded(picture: EncodedImage) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (picture.height, picture.width, 3)
     return image
 
@@ -47,7 +47,7 @@ def test_pictures_are_drawn_before_and_after_refinement(
     before, after = (_decoded(picture).astype(int) for picture in pictures[0])
     assert np.abs(before - after).max() > 60
     again = capture_section.read_capture(made.paths["frames"], made.paths["scene"])["pictures"]
-    assert [p.data for row in again for p in row] == [p.data for row in pictures for p in row]
+    assert [p.content for row in again for p in row] == [p.content for row in pictures for p in row]
     blue, green, red = cv2.split(after)
     person = (red - blue > 60) & (red - green > 40)  # red in the recorded images, all else is grey
     assert person.sum() > 5000 and np.ptp(np.nonzero(person)[0]) > 150

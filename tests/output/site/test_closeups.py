@@ -47,7 +47,7 @@ def handling(capture: fitted.Capture) -> Handling:
 
 def cells(picture: closeups.EncodedImage, columns: int) -> np.ndarray:
     """(rows, columns, 200, 200, 3) RGB of the picture's cells."""
-    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), 1)[..., ::-1].astype(int)
+    image = cv2.imdecode(np.frombuffer(picture.content, np.uint8), 1)[..., ::-1].astype(int)
     assert image.shape == (picture.height, picture.width, 3)
     return np.array(
         [
@@ -87,7 +87,7 @@ def test_every_cell_shows_skin_and_object(handling: Handling) -> None:
     (hold,) = closeups.holds(handling.probability)
     assert hold == Hold("right", 1, 3)
     picture = closeups.closeup(handling, hold)
-    assert len(picture.data) < PAGE_BYTES
+    assert len(picture.content) < PAGE_BYTES
     shown = cells(picture, 3)
     red, green, blue = np.moveaxis(shown, -1, 0)
     skin = ((blue - red > 40) & (blue > 60)).sum((2, 3))
@@ -96,7 +96,7 @@ def test_every_cell_shows_skin_and_object(handling: Handling) -> None:
     touching = ((red - green > 60) & (np.abs(green - blue) < 40)).sum((2, 3))
     # the palm is 1 mm inside the true ball; skin that faces away from the ball is not red
     assert touching[:, 2].max() > 5
-    assert picture.data == closeups.closeup(handling, hold).data
+    assert picture.content == closeups.closeup(handling, hold).content
     # the fits differ by what was put in, so that their cells do as well
     assert np.abs(shown[:, 1] - shown[:, 2]).max() > 100
 

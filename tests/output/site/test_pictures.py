@@ -76,8 +76,8 @@ def test_pictures_hide_what_is_behind_and_keep_colours() -> None:
     behind[:3, 3] = [0.25, 0, 3]
     picture = drawing.draw(
         [
-            drawing.ColouredMesh(ball.vertices, ball.faces, green, behind),
-            drawing.ColouredMesh(ball.vertices, ball.faces, red, place),
+            drawing.ColouredMesh(ball.vertices, ball.faces, behind, colours=green),
+            drawing.ColouredMesh(ball.vertices, ball.faces, place, colours=red),
         ],
         lens,
     )
@@ -111,7 +111,7 @@ def test_object_heat_shows_on_the_side_that_is_touched() -> None:
         np.asarray(ball.vertices), np.asarray(ball.faces), heat, 1.0
     )
     seen, hidden = (
-        cv2.imdecode(np.frombuffer(p.data, np.uint8), cv2.IMREAD_UNCHANGED).astype(int)
+        cv2.imdecode(np.frombuffer(p.content, np.uint8), cv2.IMREAD_UNCHANGED).astype(int)
         for p in (one, other)
     )
     assert seen.shape == (one.height, one.width, 4)

@@ -73,7 +73,7 @@ def test_carried_takes_precedence_over_doubtful() -> None:
 def test_the_sheet_shows_both_outlines_in_every_camera(made: fitted.Capture) -> None:
     sheet = _section(made)["sheet"]
     assert sheet is not None and sheet.caption.count(", ") == 4
-    bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(np.frombuffer(sheet.content, np.uint8), cv2.IMREAD_COLOR)
     assert bgr.shape == (sheet.height, sheet.width, 3)
     columns = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
     for column in columns:
