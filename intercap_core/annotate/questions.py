@@ -81,21 +81,14 @@ def keep_answer(path: Path, answer: Mapping[str, Any], by: str | None) -> None:
         record |= {"by": by, "at": datetime.now(UTC).isoformat(timespec="seconds")}
     path.parent.mkdir(parents=True, exist_ok=True)
     line = json.dumps(record, ensure_ascii=False) + "\n"
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    try:
-        size = os.fstat(handle).st_size
-        if size and not _ends_line(path, size):  # after an interrupted write
-            line = "\n" + line
-        os.write(handle, line.encode())
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _ends_line(path: Path, size: int) -> bool:
-    with open(path, "rb") as file:
-        file.seek(size - 1)
-        return file.read(1) == b"\n"
+    with path.open("ab+") as file:
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":  # after an interrupted write
+                line = "\n" + line
+        file.write(line.encode())
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _answers(question: Mapping[str, Any], answer: Mapping[str, Any]) -> bool:
@@ -165,14 +158,11 @@ def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
         lost, ambiguous = track["lost"], track["ambiguous"] & ~track["lost"]
     questions = []
-    choices: tuple[tuple[str, str], ...] = (
-        ("place", "I place it"),
-        ("hidden", "It is not visible"),
-    )
+    places = (("place", "I place it"), ("hidden", "It is not visible"))
     for first, last in runs(lost):
         message = f"The {object_} is lost here. Where is it?"
         questions.append(_question("lost", "", first, last, (first + last) // 2, message,
-                                   2.0 * (last - first + 1), choices))  # fmt: skip
+                                   2.0 * (last - first + 1), places))  # fmt: skip
     choices = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
     for first, last in runs(ambiguous):
         message = f"Is the rotation of the {object_} as drawn?"

@@ -12,17 +12,18 @@ import base64
 import json
 import secrets
 import time
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -167,23 +168,23 @@ class Guard:
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        headers = {
-            key.decode("latin-1"): value.decode("latin-1") for key, value in scope["headers"]
-        }
-        fault = refusal(scope["method"], scope["path"], headers, self._token)
-        if fault is not None:
-            await _refuse(send, *fault)
-            return
 
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message["headers"] = [*message.get("headers", []), *_HEADERS]
             await send(message)
 
-        await self._app(scope, receive, sent)
+        fault = refusal(scope["method"], scope["path"], Headers(scope=scope), self._token)
+        answer: App = self._app
+        if fault is not None:
+            status, reason = fault
+            answer = PlainTextResponse(f"{reason}\n", status)
+        await answer(scope, receive, sent)
 
 
-def refusal(method: str, path: str, headers: dict[str, str], token: str) -> tuple[int, str] | None:
+def refusal(
+    method: str, path: str, headers: Mapping[str, str], token: str
+) -> tuple[int, str] | None:
     """Return status and reason if a request is refused, else None."""
     host = headers.get("host", "")
     try:
@@ -234,9 +235,3 @@ class LimitedProtocol(H11Protocol):
         """Whether the connection is open and has no request that is being answered."""
         answered = self.cycle is None or self.cycle.response_complete
         return answered and not self.transport.is_closing()
-
-
-async def _refuse(send: Send, status: int, reason: str) -> None:
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), *_HEADERS]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": f"{reason}\n".encode()})

@@ -30,7 +30,6 @@ from intercap_core.output.export import (
     parameters,
 )
 from intercap_core.output.export.about import About, Deviations, ExportBody, Verdict
-from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
 from intercap_core.output.export.readme import NEED_OBJECT, readme
@@ -116,7 +115,7 @@ def run(
         elif name == "glb":
             (output / "glb").mkdir()
             glb.write(output / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
-    files: Sequence[WrittenBody] = ()
+    files: dict[str, dict[str, str]] = {}
     if set(formats) & _BODY_FORMATS:
         files = body_files.write(output / "body", about.body)
     if about.verdict.stated:
@@ -166,7 +165,7 @@ def _write_manifest(
     formats: Sequence[str],
     about: About,
     coordinates: Mapping[str, Coordinates],
-    body: Sequence[WrittenBody],
+    body: Mapping[str, Mapping[str, str]],
 ) -> None:
     """Write the manifest (MARKER) with the checksums of all other files of the export."""
     files = sorted(path for path in output.rglob("*") if path.is_file())
@@ -183,9 +182,7 @@ def _write_manifest(
         "up_axis": {name: own.up_axis for name, own in coordinates.items()},
         "units": {name: own.units for name, own in coordinates.items()},
         "body": about.body.to_json(),
-        "body_files": {
-            file.name: {k: v for k, v in vars(file).items() if k != "name"} for file in body
-        },
+        "body_files": body,
         **about.verdict.to_json(),
         "files": {
             path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()

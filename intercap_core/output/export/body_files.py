@@ -7,8 +7,6 @@ The project's file has 30 columns of each. Readers of SMPL-X files take the expr
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,37 +21,30 @@ _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the 
 _SHAPE, _EXPRESSION = 300, 100  # columns of a file of SMPL-X
 
 
-@dataclass(frozen=True)
-class WrittenBody:
-    """A body file of an export."""
-
-    name: str
-    """File name."""
-    digest: str
-    """Digest of the file."""
-    betas: str
-    """Columns of the shape, as start:stop."""
-    expression: str
-    """Columns of the expression, as start:stop."""
-
-
-def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
+def write(folder: Path, body: ExportBody) -> dict[str, dict[str, str]]:
     """Write the body file, and its maps of points and regions, into ``folder``.
 
     Columns beyond those of the parameters are zero, as are the pose blend shapes, which the open
-    body does not have. All other numbers are copied bit by bit. Returns the written file, none for
-    a licensed body.
+    body does not have. All other numbers are copied bit by bit.
+
+    Returns for JSON, by name of the written file, its digest and the columns (start:stop) of betas
+    and expression; {} for a licensed body, which is not written.
     """
     if not body.is_open:
-        return ()
+        return {}
     folder.mkdir()
     path = folder / f"{body.path.stem}_{_SHAPE}_{_EXPRESSION}.npz"
     shutil.copyfile(maps_path(body.path), maps_path(path))
     with np.load(body.path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     np.savez_compressed(path, allow_pickle=True, **_laid_out(arrays, body))
-    expression = f"{_SHAPE}:{_SHAPE + body.num_expression}"
-    return (WrittenBody(path.name, file_digest(path), f"0:{body.num_betas}", expression),)
+    return {
+        path.name: {
+            "digest": file_digest(path),
+            "betas": f"0:{body.num_betas}",
+            "expression": f"{_SHAPE}:{_SHAPE + body.num_expression}",
+        }
+    }
 
 
 def _laid_out(arrays: dict[str, np.ndarray], body: ExportBody) -> dict[str, np.ndarray]:

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.output.export.about import About
-from intercap_core.output.export.motion import Coordinates, Motion
+from intercap_core.output.export.motion import Coordinates, Motion, posed_batches
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
 PERSON, OBJECT = 1, 2
@@ -85,13 +84,8 @@ def write(path: Path, scenes: Scenes, about: About, names: Sequence[Mapping[int,
 
 def _keypoints(motion: Motion) -> np.ndarray:
     """Return COCO's keypoints (T, 17, 3) of the body, metres."""
-    model, points = motion.model, []
-    for t in range(len(motion)):
-        parameters = motion.parameters.frames(slice(t, t + 1))
-        parameters = type(parameters)(**{k: v.to(model.dtype) for k, v in vars(parameters).items()})
-        with torch.no_grad():
-            points.append(model.keypoints_of(parameters)[0].numpy()[_PLACES])
-    return np.stack(points)
+    batches = posed_batches(motion.model, motion.parameters)
+    return np.concatenate([motion.model.keypoints(posed).numpy()[:, _PLACES] for posed in batches])
 
 
 def _annotations(

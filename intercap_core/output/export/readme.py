@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -12,7 +12,6 @@ from intercap_core.config import ExportSettings
 from intercap_core.evaluation.verdict.figures import StatedError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import DEVIATIONS_SOURCE, About
-from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.motion import Coordinates, Motion
 from intercap_core.schemas import CONTACT_M
 
@@ -25,7 +24,7 @@ def readme(
     mesh: ObjectMesh | None,
     formats: Sequence[str],
     about: About,
-    files: Sequence[WrittenBody],
+    files: Mapping[str, Mapping[str, str]],
     settings: ExportSettings,
 ) -> str:
     """Compose README.txt.
@@ -35,7 +34,7 @@ def readme(
         viewed: the motion in the frame of amass, glb and meshes.
         mesh: None without an object; the formats that need one are then omitted.
         formats: formats that the settings list.
-        files: written body files.
+        files: written body files, from :func:`.body_files.write`.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "data"),
@@ -61,7 +60,7 @@ def readme(
         up_of_master=Coordinates.of(motion).header_lines()[1],
         contact_mm=1e3 * CONTACT_M,
         deviations_source=DEVIATIONS_SOURCE,
-        maps=maps_path(Path(files[0].name)).name if files else "",
+        maps={name: maps_path(Path(name)).name for name in files},
     )
 
 

@@ -20,7 +20,6 @@ MANIFEST, SUMS = "release.json", "release.sha256"
 FORMAT = 1
 KINDS = ("card", "tables", "site", "export", "artefact")
 _RECORDINGS = "recordings"  # folder of the studio's recordings and truth, not released
-_BLOCK = 1 << 22  # bytes read at a time
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,10 @@ def write(
 
     def read_entry(item: tuple[PurePosixPath, str]) -> ReleasedFile:
         path, kind = item
-        digest, size = _digest(folder / path)
+        file = folder / path
+        entry = ReleasedFile(path.as_posix(), kind, file.stat().st_size, _digest(file))
         progress.step()
-        return ReleasedFile(path.as_posix(), kind, size, digest)
+        return entry
 
     entries = ThreadPool(threads).map(read_entry, paths)
     content = {"format": FORMAT, **made_with, "files": [vars(entry) for entry in entries]}
@@ -115,7 +115,7 @@ def check(folder: Path, *, threads: int = 1) -> tuple[int, Differences]:
     def compare(entry: ReleasedFile) -> str:
         path = folder / entry.path
         exists = path.is_file()
-        same = exists and path.stat().st_size == entry.bytes and _digest(path)[0] == entry.sha256
+        same = exists and path.stat().st_size == entry.bytes and _digest(path) == entry.sha256
         progress.step()
         return "" if same else "changed" if exists else "missing"
 
@@ -156,13 +156,9 @@ def _sequence_of(path: PurePosixPath, kind: str) -> str | None:
     return None if of_all else path.parts[0]
 
 
-def _digest(path: Path) -> tuple[str, int]:
-    digest, size = hashlib.sha256(), 0
+def _digest(path: Path) -> str:
     with open(path, "rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
-            size += len(block)
-    return digest.hexdigest(), size
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(path: Path) -> list[ReleasedFile]:

@@ -118,21 +118,14 @@ def _over_time(sigma_mm: np.ndarray) -> str:
     ``sigma_mm``: (T, 55) standard deviation of each joint, millimetres.
     """
     left, right = FINGER_JOINTS
-    total = len(sigma_mm)
+    frames = np.arange(len(sigma_mm))
     lines = [
-        charts.Series(name, colour, np.arange(total), sigma_mm[:, at].max(1))
+        charts.Series(name, colour, frames, sigma_mm[:, at].max(1))
         for name, colour, at in (
             ("body", "c1", BODY_JOINTS), ("left hand", "c2", left), ("right hand", "c3", right),
         )
     ]  # fmt: skip
-    top = max(10.0, 1.1 * max(float(line.y.max(initial=0.0)) for line in lines))
-    return charts.line_chart(
-        lines,
-        x_label="frame",
-        y_label="largest deviation of a joint, mm",
-        x_range=(0.0, float(max(total - 1, 1))),
-        y_range=(0.0, top),
-    )
+    return charts.frame_chart(lines, len(frames), "largest deviation of a joint, mm")
 
 
 def _by_joint(sigma_mm: np.ndarray) -> str:

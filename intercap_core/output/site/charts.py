@@ -85,6 +85,13 @@ def line_chart(
     return "".join([*parts, "</svg>"])
 
 
+def frame_chart(series: Sequence[Series], total: int, y_label: str, least: float = 10.0) -> str:
+    """Plot lines over ``total`` frames; the vertical axis reaches at least to ``least``."""
+    top = max(least, *(1.1 * float(line.y.max(initial=0.0)) for line in series))
+    x_range = (0.0, float(max(total - 1, 1)))
+    return line_chart(series, x_label="frame", y_label=y_label, x_range=x_range, y_range=(0.0, top))
+
+
 def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
     """Return x and row of each entry of a legend; rows are filled from left to right."""
     places, x, row = [], float(_LEFT), 0

@@ -235,16 +235,7 @@ def _chart(
                 series.append(charts.Series(name if first else "", colour, run, values[run]))
     if not series:
         return None
-    top = max(10.0, 1.1 * max(float(line.y.max()) for line in series))
-    total = len(lines[0][2])
-    drawn = charts.line_chart(
-        series,
-        x_label="frame",
-        y_label=unit,
-        x_range=(0.0, float(max(total - 1, 1))),
-        y_range=(0.0, top),
-    )
-    return drawn, caption
+    return charts.frame_chart(series, len(lines[0][2]), unit), caption
 
 
 def _energies(terms: Sequence[tuple[str, float, float]]) -> str:

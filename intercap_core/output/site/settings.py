@@ -16,31 +16,21 @@ _LEFT_OUT = {
 
 def changed(config: Config) -> list[tuple[str, str, str]]:
     """Return name, value and default of each setting that differs from its default."""
-    own = config.model_dump(exclude=_LEFT_OUT)
-    defaults = Config(dataset="any").model_dump(exclude=_LEFT_OUT)
+    defaults = _leaves(Config(dataset="any").model_dump(exclude=_LEFT_OUT))
     return [
-        (name, _text(value), _text(_at(defaults, name)))
-        for name, value in _leaves(own)
-        if value != _at(defaults, name)
+        (name, _text(value), _text(defaults.get(name)))
+        for name, value in _leaves(config.model_dump(exclude=_LEFT_OUT)).items()
+        if value != defaults.get(name)
     ]
 
 
-def _leaves(values: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    leaves: list[tuple[str, Any]] = []
+def _leaves(values: dict[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the values by dotted name."""
+    leaves: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{above}{key}"
-        if isinstance(value, dict) and value:
-            leaves += _leaves(value, f"{name}.")
-        else:
-            leaves.append((name, value))
+        leaves |= _leaves(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
     return leaves
-
-
-def _at(values: Any, name: str) -> Any:
-    """Return the value of a dotted name, None if there is none."""
-    for key in name.split("."):
-        values = values.get(key) if isinstance(values, dict) else None
-    return values
 
 
 def _text(value: Any) -> str:

@@ -77,10 +77,8 @@ def sequence_table(
         row["extrinsics_residual_after_mm"] = 1e3 * after
         if s.has_truth:
             for stage in ESTIMATES:
-                for name, value in figures.truth_figures([s], stage).items():
-                    row[f"{stage}.{name}"] = value
-            for name, value in figures.extrinsics_figures([s]).items():
-                row[f"extrinsics_error.{name}"] = value
+                row |= _prefixed(stage, figures.truth_figures([s], stage))
+            row |= _prefixed("extrinsics_error", figures.extrinsics_figures([s]))
         rows.append(row)
     table = pd.DataFrame(rows)
     for name in _RANKED:
@@ -92,18 +90,20 @@ def sequence_table(
 
 def _figures(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
     """Pool penetration, distances to clouds with their noise floor, and accelerations."""
-    row = {}
-    for name, value in figures.penetration_figures(sequences).items():
-        row[f"penetration.{name}"] = value
-    for name, value in figures.cloud_figures(sequences).items():
-        row[f"vertex_to_cloud.{name}"] = value
-    for name, value in figures.floor_figures(sequences).items():
-        row[f"vertex_to_cloud_floor.{name}"] = value
+    row = {
+        **_prefixed("penetration", figures.penetration_figures(sequences)),
+        **_prefixed("vertex_to_cloud", figures.cloud_figures(sequences)),
+        **_prefixed("vertex_to_cloud_floor", figures.floor_figures(sequences)),
+    }
     for name in sorted(_ACCELERATIONS):
         values = figures.pooled(sequences, name)
         if values is not None:
             row[f"{name}_mm"] = 1e3 * _mean(values)
     return row
+
+
+def _prefixed(prefix: str, values: Mapping[str, float]) -> dict[str, float]:
+    return {f"{prefix}.{name}": value for name, value in values.items()}
 
 
 def group_table(
@@ -118,10 +118,8 @@ def group_table(
     rows = []
     for group in sorted({group_of[s.name] for s in sequences} - {""}):
         members = [s for s in sequences if group_of[s.name] == group]
-        flags, touching = (
-            figures.pooled_flags(members),
-            figures.pooled(members, "contact_frame"),
-        )
+        flags = figures.pooled_flags(members)
+        touching = figures.pooled(members, "contact_frame")
         row: dict[str, object] = {
             by: group,
             "sequences": len(members),
@@ -131,11 +129,9 @@ def group_table(
             "contact_percent": np.nan if touching is None else 100 * float(touching.mean()),
             **_figures(members),
         }
-        for part, value in mean_stated(members).items():
-            row[f"verdict.{part}_mm"] = value
+        row |= {f"verdict.{part}_mm": value for part, value in mean_stated(members).items()}
         if any(s.has_truth for s in members):
-            for name, value in figures.truth_figures(members, "joint").items():
-                row[f"joint.{name}"] = value
+            row |= _prefixed("joint", figures.truth_figures(members, "joint"))
         rows.append(row)
     return pd.DataFrame(rows, columns=None if rows else [by, "sequences", "frames"])
 
@@ -169,7 +165,9 @@ def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
                     name, unit = view.key.removesuffix("_m"), "_mm" if view.unit == "mm" else ""
                     for end, frames in (("", slice(None)), ("_held_out", held)):
                         errors = values[f"verdict/{view.key}{end}"][frames, place]
-                        row[f"verdict.{name}{end}{unit}"] = view.scale * _median(errors)
+                        row[f"verdict.{name}{end}{unit}"] = view.scale * figures.finite_median(
+                            errors
+                        )
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -291,8 +289,3 @@ def _significant(values: pd.Series) -> np.ndarray:
 def _mean(values: np.ndarray) -> float:
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else float("nan")
-
-
-def _median(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else float("nan")

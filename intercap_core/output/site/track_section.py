@@ -9,6 +9,7 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
+from intercap_core.evaluation.figures import finite_median
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Camera, Rig
@@ -143,7 +144,7 @@ def _timeline(track: artefacts.Artefact) -> str:
         views = np.where(used, np.where(good, "agrees", "partly"), "nothing").tolist()
         label = f"{100 * used.mean():.0f} % used"
         if used.any():
-            label += f" · IoU {_median(overlaps[c]):.2f}"
+            label += f" · IoU {finite_median(overlaps[c]):.2f}"
             label += _median_text(1e3 * depths[c], "mm") + _median_text(contours[c], "px")
         rows.append(charts.TimelineRow(name, charts.state_runs(views, VIEW_STATES), label))
     marks = [(t - 1, f"{t}: found again") for t in np.flatnonzero(track["recovered"]).tolist()]
@@ -160,25 +161,13 @@ def _states(**flags: np.ndarray) -> list[str]:
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
     """Plot values (T,), clipped to ``most``; the axis reaches at least to ``least``."""
-    known = np.isfinite(values)
-    shown = np.minimum(values, most)
-    top = max(least, 1.1 * float(shown[known].max(initial=0.0)))
-    line = charts.Series("", "c1", np.flatnonzero(known), shown[known])
-    return charts.line_chart(
-        [line],
-        x_label="frame",
-        y_label=label,
-        x_range=(0.0, float(max(len(values) - 1, 1))),
-        y_range=(0.0, top),
-    )
+    known = np.flatnonzero(np.isfinite(values))
+    line = charts.Series("", "c1", known, np.minimum(values, most)[known])
+    return charts.frame_chart([line], len(values), label, least)
 
 
 def _median_text(values: np.ndarray, unit: str) -> str:
-    return f" · {_median(values):.1f} {unit}" if np.isfinite(values).any() else ""
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values[np.isfinite(values)]))
+    return f" · {finite_median(values):.1f} {unit}" if np.isfinite(values).any() else ""
 
 
 def _mean(values: np.ndarray, axis: int) -> np.ndarray:
