@@ -25,6 +25,7 @@ from intercap_core.output.release.card import facts, markdown, split_table
 from intercap_core.output.release.croissant import croissant
 from intercap_core.output.site import overview, tables
 from intercap_core.output.site.heat_pictures import body_surfaces, highest, object_pictures
+from intercap_core.output.site.measures import median_residuals
 from intercap_core.output.site.overview import DatasetContent, Heat
 from intercap_core.schemas import CONTACT_M, HEATMAPS
 
@@ -70,7 +71,7 @@ def run(
     measured = [s.metrics for s in found]
     intents = {s.name: s.intent for s in found}
     by_sequence = tables.sequence_table(
-        measured, {s.name: _medians(s.residuals) for s in found}, intents
+        measured, {s.name: median_residuals(s.residuals) for s in found}, intents
     )
     groups = {
         "objects": tables.group_table(measured, "object", {s.name: s.object_ for s in measured}),
@@ -192,18 +193,6 @@ def _object_heat(
     return Heat(
         name, object_pictures(mesh.vertices, mesh.faces, found, common or top), top, found.frames
     )
-
-
-def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
-    """Median residuals before and after refinement, over camera pairs that have both; NaN if none.
-
-    ``pairs``: name, residual before and residual after the refinement of the cameras.
-    """
-    known = np.array([pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()])
-    if not len(known):
-        return float("nan"), float("nan")
-    before, after = np.median(known, axis=0)
-    return float(before), float(after)
 
 
 def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:

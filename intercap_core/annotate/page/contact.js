@@ -5,6 +5,7 @@
  * all estimated intervals into the draft, with uncertain ends. An end that is moved is exact. */
 import { fromBase64 } from "./api.js";
 import { UNCONFIRMED } from "./draft.js";
+import { intervals } from "./sides.js";
 
 const TOUCHING = 0.5; // least probability of estimated contact
 
@@ -32,16 +33,9 @@ export class Contact {
 
   /* Runs of frames of each part with a probability of at least TOUCHING. */
   estimated() {
-    const intervals = [];
-    for (const part of this.regions) {
-      let start = -1;
-      for (let t = 0; t <= this.app.info.frames; t += 1) {
-        const on = t < this.app.info.frames && (this.probabilityAt(part, t) ?? 0) >= TOUCHING;
-        if (on && start < 0) start = t;
-        if (!on && start >= 0) { intervals.push({ part, start, end: t, uncertain: "both" }); start = -1; }
-      }
-    }
-    return intervals;
+    const frames = Array.from({ length: this.app.info.frames }, (_, t) => t);
+    return this.regions.flatMap((part) =>
+      intervals(frames.map((t) => (this.probabilityAt(part, t) ?? 0) >= TOUCHING)).map(([start, end]) => ({ part, start, end, uncertain: "both" })));
   }
 
   /* Intervals of the draft; null if it states nothing about contact. */

@@ -34,6 +34,17 @@ export function refill(box, ...children) {
   (next ?? now[0])?.focus({ preventScroll: true });
 }
 
+/* Call `move` with the events of the pointer until it is released, then `end`. */
+export function followPointer(move, end = () => {}) {
+  const up = (event) => {
+    removeEventListener("pointermove", move);
+    for (const kind of ["pointerup", "pointercancel"]) removeEventListener(kind, up);
+    end(event);
+  };
+  addEventListener("pointermove", move);
+  for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, up);
+}
+
 /* Show a dialog; resolves to the value of the pressed button, "" if the dialog was closed.
  * `choices`: [value, text, whether it is the main button] of each button. */
 export function ask(title, body, choices) {

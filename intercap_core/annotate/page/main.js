@@ -268,18 +268,14 @@ class App {
     this.hintTimer = setTimeout(() => { box.textContent = this.mode?.hint ?? ""; box.hidden = !this.mode; }, 5000);
   }
 
-  undo() {
-    if (this.paint && this.mode === this.paint) { this.paint.undo(); return; }
-    this.pose?.finishWheel();
-    this.draft.undo();
-    if (this.pose?.editing) this.pose.followDraft();
-    this.panels();
-  }
+  undo() { this.#step("undo"); }
 
-  redo() {
-    if (this.paint && this.mode === this.paint) { this.paint.redo(); return; }
+  redo() { this.#step("redo"); }
+
+  #step(by) {
+    if (this.paint && this.mode === this.paint) { this.paint[by](); return; }
     this.pose?.finishWheel();
-    this.draft.redo();
+    this.draft[by]();
     if (this.pose?.editing) this.pose.followDraft();
     this.panels();
   }
@@ -313,11 +309,8 @@ class App {
   #tabs() {
     const panels = { doubts: "Issues", questions: "Questions", object: "Object", marks: "Subject, floor, frames", sides: "Left/right", run: "Run" };
     if (!this.info.object) delete panels.object;
-    find("tabs").replaceChildren(...Object.entries(panels).map(([name, text]) => {
-      const tab = button(text, () => this.tab(name), { id: `tab-${name}`, role: "tab", data: { tab: name } });
-      tab.setAttribute("aria-controls", "panels");
-      return tab;
-    }));
+    find("tabs").replaceChildren(...Object.entries(panels).map(([name, text]) =>
+      button(text, () => this.tab(name), { id: `tab-${name}`, role: "tab", "aria-controls": "panels", data: { tab: name } })));
     find("panels").setAttribute("role", "tabpanel");
     this.tab("doubts");
   }

@@ -1,7 +1,7 @@
 /* The object's pose in a frame: moved and rotated by dragging in a view or in 3D, by numbers, or by a
  * fit to the images. No other module knows how the annotation stores poses. */
 import { post } from "./api.js";
-import { button, make } from "./dom.js";
+import { button, followPointer, make } from "./dom.js";
 import { same } from "./draft.js";
 import { IDENTITY, apply, invert, rigid, rotationVector, rows, rotate, rotateAbout } from "./geometry.js";
 
@@ -176,13 +176,7 @@ export class PoseEditor {
       event.stopImmediatePropagation();
       event.preventDefault();
       const drag = this.drag(event, camera);
-      const up = () => {
-        window.removeEventListener("pointermove", drag.move);
-        window.removeEventListener("pointerup", up);
-        drag.end();
-      };
-      window.addEventListener("pointermove", drag.move);
-      window.addEventListener("pointerup", up);
+      followPointer(drag.move, drag.end);
     }, { capture: true });
   }
 

@@ -197,10 +197,8 @@ function skinPaint(header, arrays) {
 
 function viewerElement() {
   const part = (tag, name, more = {}, ...children) => make(tag, { ...more, data: { part: name } }, ...children);
-  const root = make("div", { class: "viewer", tabIndex: 0, role: "group" },
+  return make("div", { class: "viewer", tabIndex: 0, role: "group", "aria-label": "Sequence in 3D over time" },
     make("div", { class: "stage" }, part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" })),
     make("details", {}, make("summary", {}, "3D view"), part("div", "layers", { role: "group", "aria-label": "Shown in 3D" }),
       make("label", {}, "view ", part("select", "views", {}, new Option("free", "-1"))), part("button", "reset", { type: "button" }, "Overview")));
-  root.setAttribute("aria-label", "Sequence in 3D over time");
-  return root;
 }

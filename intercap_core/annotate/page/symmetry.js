@@ -61,11 +61,9 @@ export class SymmetryEditor {
     const head = make("h2", {}, "Symmetry");
     if (!this.stored) return make("div", {}, head, button("Show the symmetry", () => this.load()));
     const names = [...Object.keys(CHOICES), ...(this.saved === CUSTOM ? [CUSTOM] : [])];
-    const choose = make("select", { onchange: () => { this.choice = choose.value; this.angle = 0; this.app.panels(); this.app.redraw(); } },
+    const choose = make("select", { "aria-label": "Symmetry of the object", onchange: () => { this.choice = choose.value; this.angle = 0; this.app.panels(); this.app.redraw(); } },
       names.map((name) => new Option(CHOICES[name]?.[0] ?? "as in objects.yaml", name, false, name === this.choice)));
-    choose.setAttribute("aria-label", "Symmetry of the object");
-    const slider = make("input", { type: "range", min: "0", max: "360", step: "1", value: String((this.angle * 180) / Math.PI), oninput: () => { this.angle = (slider.valueAsNumber * Math.PI) / 180; this.app.redraw(); } });
-    slider.setAttribute("aria-label", "Rotation of the drawn object, degrees");
+    const slider = make("input", { type: "range", "aria-label": "Rotation of the drawn object, degrees", min: "0", max: "360", step: "1", value: String((this.angle * 180) / Math.PI), oninput: () => { this.angle = (slider.valueAsNumber * Math.PI) / 180; this.app.redraw(); } });
     return make("div", {}, head, choose, CHOICES[this.choice]?.[2] ? make("label", {}, " rotate the drawn object ", slider) : null,
       this.choice !== this.saved && CHOICES[this.choice] ? button("Save the symmetry…", () => this.save(), { class: "main" }) : null);
   }

@@ -1,5 +1,5 @@
 /* The timeline: flags, doubts, dropped frames, object poses, left and right, and contact by body part. */
-import { button, find, make, refill, readable } from "./dom.js";
+import { button, find, followPointer, make, refill, readable } from "./dom.js";
 import { OTHER, id, isUncertain } from "./contact.js";
 import { posedFrames } from "./pose.js";
 import { sidesRows } from "./sides_panel.js";
@@ -33,9 +33,7 @@ export class Timeline {
     if (event.target.closest("button, .bar") || !event.target.closest(".lane")) return;
     const go = (e) => this.app.show(Math.floor(this.#frameAt(e)));
     go(event);
-    const end = () => { window.removeEventListener("pointermove", go); window.removeEventListener("pointerup", end); };
-    window.addEventListener("pointermove", go);
-    window.addEventListener("pointerup", end);
+    followPointer(go);
   }
 
   /* Body parts that have a row. */
@@ -88,8 +86,7 @@ export class Timeline {
   }
 
   #mark(start, end, kind, label, act) {
-    const mark = make("button", { type: "button", class: kind, title: label, onclick: act });
-    mark.setAttribute("aria-label", label);
+    const mark = button("", act, { class: kind, title: label, "aria-label": label });
     mark.style.left = this.at(start);
     mark.style.width = this.at(Math.max(end - start, 0.5));
     return mark;
@@ -98,8 +95,7 @@ export class Timeline {
   /* Shade frames by a value from 0 to 1. */
   #heat(share) {
     const { frames } = this.app.info;
-    const heat = make("canvas", { width: frames, height: 1 });
-    heat.setAttribute("aria-hidden", "true");
+    const heat = make("canvas", { width: frames, height: 1, "aria-hidden": "true" });
     const brush = heat.getContext("2d");
     for (let t = 0; t < frames; t += 1) {
       brush.fillStyle = `rgba(237, 128, 16, ${(0.75 * share(t)).toFixed(3)})`;
@@ -143,10 +139,8 @@ export class Timeline {
 
   /* A bar with ends that can be dragged. */
   #bar(title, interval, kind, text) {
-    const bar = make("button", { type: "button", class: `bar ${kind}`, title, data: { interval } },
+    return make("button", { type: "button", class: `bar ${kind}`, title, "aria-label": title, data: { interval } },
       make("i", { class: "end left", data: { end: "start" } }), make("span", {}, text), make("i", { class: "end right", data: { end: "end" } }));
-    bar.setAttribute("aria-label", title);
-    return bar;
   }
 
   #part(part) {
@@ -202,28 +196,24 @@ export class Timeline {
       this.#place(bar, start, stop);
       app.show(end === "end" ? stop - 1 : start);
     };
-    const up = () => {
-      window.removeEventListener("pointermove", move);
-      window.removeEventListener("pointerup", up);
+    const storeEnds = () => {
       const same = start === interval.start && stop === interval.end;
       const name = same ? bar.dataset.interval : store(start, stop);
       if (same && (app.frame < interval.start || app.frame >= interval.end)) app.show(interval.start);
       this.rows.querySelector(`[data-interval="${name}"]`)?.focus({ preventScroll: true });
     };
-    window.addEventListener("pointermove", move);
-    window.addEventListener("pointerup", up);
+    followPointer(move, storeEnds);
     event.preventDefault();
     bar.focus({ preventScroll: true });
   }
 
   #contactBar() {
     const { app, contact } = this, { info } = app, selected = contact.selectedAt(app.frame);
-    const choose = make("select", { id: "part", onchange: () => {
+    const choose = make("select", { id: "part", "aria-label": "Add contact at this frame", onchange: () => {
       if (!choose.value) return;
       this.extra.add(choose.value);
       contact.add(choose.value, app.frame, Math.min(app.info.frames, app.frame + Math.ceil(app.info.fps / 2)));
     } }, new Option("add contact here…", ""), ...["any", ...contact.regions].map((part) => new Option(readable(part), part)));
-    choose.setAttribute("aria-label", "Add contact at this frame");
     const state = contact.stated ? !contact.stated.length ? "annotated: no contact in the whole sequence"
       : `${contact.stated.length} annotated, ${contact.stated.filter((interval) => !contact.isConfirmed(interval)).length} not yet confirmed`
       : contact.probability ? "estimated contact: the first edit copies it into the annotation" : "no contact has been estimated yet";
@@ -246,9 +236,7 @@ export class Timeline {
     const { app } = this;
     find("frame").value = app.frame;
     const cursor = this.rows.querySelector(".cursor");
-    if (cursor) {
-      this.#place(cursor, app.frame, app.frame + 1);
-    }
+    if (cursor) this.#place(cursor, app.frame, app.frame + 1);
     for (const bar of this.rows.querySelectorAll(".unfinished")) {
       const from = Number(bar.dataset.from);
       this.#place(bar, Math.min(from, app.frame), Math.max(from, app.frame) + 1);

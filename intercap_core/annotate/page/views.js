@@ -1,5 +1,5 @@
 /* Camera views of the same frame, some large and the others in a strip: image, overlay and marks. */
-import { find, make } from "./dom.js";
+import { find, followPointer, make } from "./dom.js";
 import { apply, project } from "./geometry.js";
 
 const PREFETCHED = 4; // frames that are fetched ahead
@@ -21,8 +21,7 @@ export class Views {
   }
 
   #view(camera, index) {
-    const canvas = make("canvas", { role: "img", tabIndex: 0 });
-    canvas.setAttribute("aria-label", `Camera ${camera.name}`);
+    const canvas = make("canvas", { role: "img", tabIndex: 0, "aria-label": `Camera ${camera.name}` });
     const figure = make("figure", { class: "view", data: { camera: camera.name } }, canvas,
       make("figcaption", {}, camera.name));
     const [w, h] = camera.size;
@@ -56,16 +55,7 @@ export class Views {
     const drag = this.app.mode?.press?.(view, event) ?? this.#pan(view, event);
     if (!drag) return;
     canvas.setPointerCapture(event.pointerId);
-    const move = (next) => drag.move?.(next);
-    const up = (next) => {
-      canvas.removeEventListener("pointermove", move);
-      canvas.removeEventListener("pointerup", up);
-      canvas.removeEventListener("pointercancel", up);
-      drag.end?.(next);
-    };
-    canvas.addEventListener("pointermove", move);
-    canvas.addEventListener("pointerup", up);
-    canvas.addEventListener("pointercancel", up);
+    followPointer((next) => drag.move?.(next), (next) => drag.end?.(next));
   }
 
   #pan(view, event) {

@@ -62,12 +62,11 @@ class _Document:
         }  # fmt: skip
         if target is not None:
             view["target"] = target
-        self.json["bufferViews"].append(view)
         padded = data + b"\0" * (-len(data) % 4)
         self._chunks.append(padded)
         self._length += len(padded)
         entry: dict[str, Any] = {
-            "bufferView": len(self.json["bufferViews"]) - 1,
+            "bufferView": self.add("bufferViews", view),
             "componentType": _COMPONENTS[values.dtype.str],
             "count": len(values),
             "type": _SHAPES[1 if values.ndim == 1 else values.shape[1]],
@@ -75,8 +74,7 @@ class _Document:
         if bounds:
             table = values.reshape(len(values), -1)
             entry["min"], entry["max"] = table.min(0).tolist(), table.max(0).tolist()
-        self.json["accessors"].append(entry)
-        return len(self.json["accessors"]) - 1
+        return self.add("accessors", entry)
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
         """Append an entry to a list of the JSON part; return its index."""
@@ -116,7 +114,7 @@ def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, 
     children = [skeleton]
     if mesh is not None:
         children.append(_object(document, motion, mesh, animation, times))
-    world = {"name": "world", "rotation": _to_floats(root.as_quat()), "children": children}
+    world = {"name": "world", "rotation": root.as_quat().tolist(), "children": children}
     # glTF ignores the transform of a skinned mesh, so its node is at the top.
     document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]
     document.add("animations", animation)
@@ -125,11 +123,9 @@ def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, 
 
 def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
     """Return the coordinates of the scene after the root's rotation."""
-    if z_up:
-        frame = f"y up, turned by the node world from: {motion.frame}"
-        return Coordinates(frame, _YUP_FROM_ZUP.apply(motion.up))
-    frame = f"y up as the camera was held, turned by the node world from: {motion.frame}"
-    return Coordinates(frame, _YUP_FROM_CAMERA.apply(motion.up))
+    turn, held = (_YUP_FROM_ZUP, "") if z_up else (_YUP_FROM_CAMERA, " as the camera was held")
+    frame = f"y up{held}, turned by the node world from: {motion.frame}"
+    return Coordinates(frame, turn.apply(motion.up))
 
 
 def _body(
@@ -156,7 +152,7 @@ def _body(
     for index, name in enumerate(JOINT_NAMES):
         parent = PARENTS[index]
         offset = joints[index] - (joints[parent] if parent >= 0 else 0)
-        node: dict[str, Any] = {"name": name, "translation": _to_floats(offset)}
+        node: dict[str, Any] = {"name": name, "translation": offset.tolist()}
         below = [first + child for child, up in enumerate(PARENTS) if up == index]
         if below:
             node["children"] = below
@@ -244,7 +240,3 @@ def _linear(colours: np.ndarray) -> np.ndarray:
     values = linear(colours)
     values[:, 3] = colours[:, 3] / 255.0
     return values
-
-
-def _to_floats(values: np.ndarray) -> list[float]:
-    return [float(v) for v in values]

@@ -317,8 +317,13 @@ class Slice:
         return _encode_png(picture, name)
 
 
+def camera_colour(c: int) -> str:
+    """Return the colour of a camera as "#rrggbb"."""
+    return CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
+
+
 def _rgb(c: int) -> tuple[int, int, int]:
-    text = CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
+    text = camera_colour(c)
     red, green, blue = (int(text[i : i + 2], 16) for i in (1, 3, 5))
     return red, green, blue
 

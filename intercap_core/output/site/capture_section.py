@@ -15,9 +15,9 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.output.export.motion import describe_up
 from intercap_core.output.site import charts, embed
 from intercap_core.output.site.capture_pictures import (
-    CAMERA_COLOURS,
     CapturePictures,
     FloorProfile,
+    camera_colour,
     draw_capture,
 )
 from intercap_core.schemas import FRAMES, SCENE
@@ -62,7 +62,7 @@ def read_capture(frames: Path, scene: Path) -> dict[str, Any]:
             "states": list(STATES.items()),
             "gaps": [f"after frame {t} ({count} {_sets(count)})" for t, count in missing],
             "cameras": cameras,
-            "legend": [(name, _colour(c)) for c, name in enumerate(names)],
+            "legend": [(name, camera_colour(c)) for c, name in enumerate(names)],
             "sets": len(times),
         }
 
@@ -246,7 +246,7 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
 def _profile_chart(
     profiles: Sequence[FloorProfile], x_range: tuple[float, float], top: float
 ) -> str:
-    series = [charts.Series("", _colour(p.c), p.along, 1e3 * p.height) for p in profiles]
+    series = [charts.Series("", camera_colour(p.c), p.along, 1e3 * p.height) for p in profiles]
     return charts.line_chart(
         series,
         x_label="along the strip, m",
@@ -254,10 +254,6 @@ def _profile_chart(
         x_range=x_range,
         y_range=(-top, top),
     )
-
-
-def _colour(c: int) -> str:
-    return CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
 
 
 def _sets(count: int) -> str:

@@ -240,6 +240,16 @@ def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str,
     return rows
 
 
+def median_residuals(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
+    """Return medians before and after refinement over the pairs of cameras that have both.
+
+    NaN if there is none. ``pairs``: name, and residual before and after refinement.
+    """
+    known = np.array([pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()])
+    before, after = np.median(known, axis=0) if len(known) else (np.nan, np.nan)
+    return float(before), float(after)
+
+
 def cameras(
     sequences: Sequence[SequenceMetrics],
     residuals: Mapping[str, Sequence[tuple[str, float, float]]],
@@ -252,29 +262,18 @@ def cameras(
     if len(residuals) == 1:
         rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(residuals.values()))]
     else:
-        rows = []
-        for name, pairs in residuals.items():
-            known = [pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()]
-            values = 1e3 * np.array(known).reshape(-1, 2)
-            before, after = np.median(values, axis=0) if len(values) else (np.nan, np.nan)
-            rows.append((name, float(before), float(after)))
+        medians = {name: median_residuals(pairs) for name, pairs in residuals.items()}
+        rows = [(name, 1e3 * before, 1e3 * after) for name, (before, after) in medians.items()]
         rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))
     note = "Worst first." if len(rows) > 3 else ""
     if len(rows) > _MAX_CAMERA_ROWS:
         note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
+    bars = [charts.BarPair.change(*row, "", False) for row in rows[:_MAX_CAMERA_ROWS]]
     return {
-        "chart": _residual_chart(rows[:_MAX_CAMERA_ROWS]),
+        "chart": charts.bar_pairs(bars, "residual, mm") if bars else "",
         "note": note,
         "truth": figures.extrinsics_figures(sequences) or None,
     }
-
-
-def _residual_chart(rows: Sequence[tuple[str, float, float]]) -> str:
-    if not rows:
-        return ""
-    return charts.bar_pairs(
-        [charts.BarPair.change(*row, "", False) for row in rows], "residual, mm"
-    )
 
 
 # label, unit and digits of IMAGE_MEASURES

@@ -24,7 +24,7 @@ from intercap_core.evaluation.truth import Truth
 from intercap_core.flags import Flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.motion import z_up_frame
 from intercap_core.output.viewer.skinning import skinned
@@ -211,10 +211,8 @@ def _add_poses(
     content: Content, name: str, rotation: np.ndarray, translation: np.ndarray, zup: np.ndarray
 ) -> None:
     """Add zup_from_object (T, 3, 4), NaN without a pose."""
-    poses = np.concatenate(
-        [zup[:3, :3] @ rotation, (translation @ zup[:3, :3].T + zup[:3, 3])[..., None]], 2
-    )
-    content.arrays[f"{name}/object"] = poses.astype(np.float32)
+    poses = zup @ rigid(rotation, translation)
+    content.arrays[f"{name}/object"] = poses[:, :3].astype(np.float32)
 
 
 def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
