@@ -57,8 +57,6 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
         _dump(scene / "scene_camera.json", scene_camera(camera, list(poses)))
         _dump(scene / "scene_gt.json", scene_gt(camera, poses, obj_id))
         lenses[scene.name] = {"camera": camera.name, **scenes.lens_of(number)}
-        if number == 0:
-            _dump(folder / "camera.json", _camera(camera))
         info: dict[str, Any] = {}
         if masks:
             info = {
@@ -77,6 +75,12 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
             for image in poses
             if not info or info[str(image)][0]["visib_fract"] >= 0.1  # as BOP 2019
         ]
+    lens = scenes.rig[0].colour  # each scene has its own
+    camera_json = {
+        "fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy,
+        "width": lens.width, "height": lens.height, "depth_scale": 1.0,
+    }  # fmt: skip
+    _dump(folder / "camera.json", camera_json)
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
     text = about.to_json_text(Coordinates.of(scenes.motion, UNITS))
@@ -91,15 +95,6 @@ def _write_model(folder: Path, mesh: ObjectMesh, obj_id: int) -> None:
     lines = [f"object {mesh.name}", "frame: the object's own", "units: millimetres"]
     (folder / f"obj_{obj_id:06d}.ply").write_bytes(ply(scaled, lines))
     _dump(folder / "models_info.json", {str(obj_id): model_info(mesh)})
-
-
-def _camera(camera: Camera) -> dict[str, Any]:
-    """Return the content of camera.json: the first camera's lens. Each scene has its own lens."""
-    lens = camera.colour
-    return {
-        "fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy,
-        "width": lens.width, "height": lens.height, "depth_scale": 1.0,
-    }  # fmt: skip
 
 
 def _write_masks(scene: Path, drawn: Silhouettes, camera: Camera) -> dict[str, Any]:

@@ -114,11 +114,6 @@ def read_motion(
         model = load_model(body_models, gender, artefact)
     vector = single.vector().double()
     parameters = BodyParameters.from_vector(vector, num_betas=model.num_betas)
-    # The expression does not measurably move the joints, so the first frame's is used for all.
-    rest = replace(model.zeros(1), betas=single.betas[:1], expression=single.expression[:1])
-    with torch.no_grad():
-        # one vertex, because only the joints are needed
-        pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().numpy()
     return Motion(
         sequence=str(attributes["sequence"]),
         subject=str(attributes["subject"]),
@@ -127,7 +122,8 @@ def read_motion(
         fps=fps,
         model=model,
         parameters=parameters,
-        pelvis=pelvis,
+        # the expression does not measurably move the joints: that of the first frame is used
+        pelvis=rest_pose(model, parameters)[1][0],
         rotation=rotation,
         translation=translation,
         frame="master colour camera: x right, y down, z forward, metres",

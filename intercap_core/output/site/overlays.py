@@ -59,13 +59,9 @@ def choose_frames(residual: np.ndarray, count: int) -> list[int]:
         return list(range(total))
     worst = int(np.argmax(np.nan_to_num(residual, nan=-np.inf)))
     spread = [int((i + 0.5) * total / max(1, count - 1)) for i in range(count - 1)]
-    chosen = sorted({worst, *spread})
-    for t in range(total):  # the worst frame may be one of the spread frames
-        if len(chosen) >= count:
-            break
-        if t not in chosen:
-            chosen = sorted([*chosen, t])
-    return chosen
+    chosen = {worst, *spread}  # the worst frame may be one of the spread frames
+    others = [t for t in range(total) if t not in chosen]
+    return sorted([*chosen, *others[: count - len(chosen)]])
 
 
 def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -> list[int]:

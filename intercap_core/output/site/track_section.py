@@ -153,10 +153,7 @@ def _timeline(track: artefacts.Artefact) -> str:
 
 def _states(**flags: np.ndarray) -> list[str]:
     """Return for each frame the name of its first set flag (T,), "moving" if none is set."""
-    return [
-        next((name for name, value in zip(flags, frame, strict=True) if value), "moving")
-        for frame in zip(*flags.values(), strict=True)
-    ]
+    return np.select(list(flags.values()), list(flags), "moving").tolist()
 
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
