@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,12 +13,12 @@ from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
 from intercap_core.annotation import Annotation, RecordingExtent
-from intercap_core.config import Config
+from intercap_core.config import Config, StudioCapture
 from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import read_label_map
 from intercap_core.inputs.documents import read_yaml
-from intercap_core.inputs.files import quoted
+from intercap_core.inputs.files import name_some, quoted
 from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 from intercap_core.validation import describe, parse_entry, read_table
@@ -73,7 +73,7 @@ class Project:
         if name not in self.sequences:
             raise UserError(
                 f"{self.path}: sequence {name!r} is not in the table; it lists "
-                f"{_some(self.sequences)}"
+                f"{name_some(sorted(self.sequences), MAX_NAMES)}"
             )
 
     def paths(self, sequence: str) -> SequencePaths:
@@ -137,8 +137,7 @@ class Project:
                 )
             return Annotation()
         faults: list[str] = []
-        values = _or_empty(read_yaml(path))
-        annotation = parse_entry(Annotation, values, str(path), "annotation", faults)
+        annotation = parse_entry(Annotation, read_yaml(path), str(path), "annotation", faults)
         if annotation is None:
             raise UserError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
         problem = annotation.check_object(self.sequences[sequence].object)
@@ -147,9 +146,7 @@ class Project:
                 f"{path}: {problem}; remove the section, or name the object of sequence "
                 f"{sequence!r} in the table"
             )
-        if not look_at_frames:
-            return annotation
-        extent = self.recording_extent(sequence)
+        extent = self.recording_extent(sequence) if look_at_frames else None
         problem = annotation.check_recording(extent) if extent else None
         if extent and problem:
             counted = " (numbered from 0)" if annotation.check_frames(extent.frames) else ""
@@ -170,22 +167,23 @@ class Project:
             )
         return None
 
+    @property
+    def captures(self) -> Mapping[str, StudioCapture]:
+        """The studio's recordings by sequence."""
+        return self.config.studio.captures if self.config.studio else {}
+
     def annotation_made(self, sequence: str) -> bool:
         """Whether the studio writes this sequence's annotation along with its recordings.
 
         It holds the truth with errors (``annotate``), the cameras' starts (``states_starts``), or
         both.
         """
-        captures = self.config.studio.captures if self.config.studio else {}
-        if sequence not in captures:
-            return False
-        return captures[sequence].annotate or captures[sequence].states_starts is not None
+        capture = self.captures.get(sequence)
+        return capture is not None and (capture.annotate or capture.states_starts is not None)
 
     def recordings_made(self, sequence: str) -> Path | None:
         """Folder into which the studio writes this sequence; None for a real recording."""
-        if self.config.studio is None or sequence not in self.config.studio.captures:
-            return None
-        return self.results / "recordings" / sequence
+        return self.results / "recordings" / sequence if sequence in self.captures else None
 
 
 def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Project:
@@ -196,9 +194,8 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     """
     project, faults = read_project(path, overrides)
     if faults:
-        more = len(faults) - 1
-        hint = f" (and {more} more: intercap check {path} lists them)" if more else ""
-        raise UserError(faults[0] + hint)
+        hint = f" (and {len(faults) - 1} more: intercap check {path} lists them)"
+        raise UserError(faults[0] + (hint if len(faults) > 1 else ""))
     return project
 
 
@@ -207,10 +204,9 @@ def read_project(
 ) -> tuple[Project, list[str]]:
     """Read a settings file and all its tables; returns the valid part and all faults.
 
-    The faults name file, row and field. Those that others may follow from come first: settings,
-    people, objects, sequences, then missing files. If there are faults, the project has the valid
-    settings, rows and entries, and rows whose ``subject`` or ``object`` it lacks ("" if the cell is
-    faulty). Raises UserError if the settings file cannot be read.
+    Faults that others may follow from come first: settings, people, objects, sequences, then
+    missing files. The valid part may have rows whose ``subject`` or ``object`` it lacks ("" if the
+    cell is faulty). Raises UserError if the settings file cannot be read.
     """
     path = Path(path)
     faults: list[str] = []
@@ -233,10 +229,10 @@ def read_project(
         for field, (known, file) in listed.items():
             value = getattr(row, field)
             if value and value not in known:
+                names = name_some(sorted(known), MAX_NAMES) or "empty"
                 faults.append(
                     f"{table}: sequence {name!r} has {field} {value!r}, which is not in "
-                    f"the table of {field}s {file} ({_some(known) or 'empty'}); correct the "
-                    f"name or add the {field}"
+                    f"the table of {field}s {file} ({names}); correct the name or add the {field}"
                 )
         if name not in config.exclude:
             valid[name] = _absolute(row, table.parent)
@@ -259,12 +255,7 @@ def read_project(
 
 def _read_config(path: Path, overrides: Mapping[str, Any], faults: list[str]) -> Config:
     """The valid entries of a settings file, with absolute or working-directory-relative paths."""
-    values = _or_empty(read_yaml(path))
-    if not isinstance(values, dict):
-        raise UserError(
-            f"{path}: expected names and values, found {type(values).__name__}; "
-            "config/README.md lists them"
-        )
+    values = _read_mapping(path, "names and values", "config/README.md lists them")
     values = _merged(values, overrides)
     try:
         config = Config.model_validate(values)
@@ -295,13 +286,6 @@ def _without(values: Mapping[str, Any], place: Sequence[int | str]) -> dict[str,
     return left
 
 
-def _some(names: Iterable[str]) -> str:
-    """Sorted names as text, at most the first ``MAX_NAMES``."""
-    found = sorted(names)
-    more = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
-    return ", ".join(found[:MAX_NAMES]) + more
-
-
 def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Values with overrides; nested mappings are merged."""
     merged = dict(values)
@@ -312,53 +296,47 @@ def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str
     return merged
 
 
-def _faults_of_files(project: Project) -> Iterator[str]:
-    """Messages about missing meshes and body files, which sequences share."""
+def _named_files(project: Project) -> Iterator[tuple[str, Path | None, str]]:
+    """Files that sequences share: beginning and end of a message that a file is missing."""
+    config, settings = project.config, project.path
     for name in project.objects_named():
-        entry = project.objects[name]
         for field in ("mesh", "contact_vertices"):
-            file = getattr(entry, field)
-            if file is not None and not file.is_file():
-                yield (
-                    f"{tidy(project.path.parent / project.config.objects)}: object {name!r} has "
-                    f"{field} {file}, and there is no such file; correct the path"
-                )
-        problem = project.config.joint.check_object(entry)
-        if problem:
-            yield f"{tidy(project.path.parent / project.config.objects)}: {problem}"
-    for field, file in project.config.body_models:
+            place = f"{tidy(settings.parent / config.objects)}: object {name!r} has {field}"
+            yield place, getattr(project.objects[name], field), "correct the path"
+    for field, file in config.body_models:
+        advice = "correct the path, or remove the line to use the open model"
+        yield f"{settings}: body_models.{field} is", file, advice
+    advice = "write it by 'intercap keypoint-definition', or remove the line"
+    definition = config.body_fit.keypoint_definition
+    yield f"{settings}: body_fit.keypoint_definition is", definition, advice
+    for file in config.joint.lemo_files or ():
+        advice = "name the folder of LEMO's release, or remove the line"
+        yield f"{settings}: joint.lemo is {config.joint.lemo} and names", file, advice
+    for field in ("segmentation_model", "keypoint_model", "segmentation_labels", "category_names"):
+        file = getattr(config.detections, field)
+        yield f"{settings}: detections.{field} is", file, "correct the path"
+
+
+def _faults_of_files(project: Project) -> Iterator[str]:
+    """Messages about missing meshes, body files and models, and about what they lack."""
+    config = project.config
+    for place, file, advice in _named_files(project):
         if isinstance(file, Path) and not file.is_file():
-            yield (
-                f"{project.path}: body_models.{field} is {file}, and there is no such file; "
-                "correct the path, or remove the line to use the open model"
-            )
-    definition = project.config.body_fit.keypoint_definition
-    if definition is not None and not definition.is_file():
-        yield (
-            f"{project.path}: body_fit.keypoint_definition is {definition}, and there is no such "
-            "file; write it by 'intercap keypoint-definition', or remove the line"
-        )
-    for file in project.config.joint.lemo_files or ():
-        if not file.is_file():
-            yield (
-                f"{project.path}: joint.lemo is {project.config.joint.lemo}, and there is no file "
-                f"{file}; name the folder of LEMO's release, or remove the line to penalise the "
-                "joints' accelerations instead"
-            )
-    yield from _faults_of_bodies(project)
-    yield from _faults_of_detectors(project)
-
-
-def _faults_of_bodies(project: Project) -> Iterator[str]:
-    """Messages if body files are named, but none for some subject.
-
-    That subject would get the open body, whose mesh differs from the files'.
-    """
-    models = project.config.body_models
+            yield f"{place} {file}, and there is no such file; {advice}"
+    for name in project.objects_named():
+        problem = config.joint.check_object(project.objects[name])
+        if problem:
+            yield f"{tidy(project.path.parent / config.objects)}: {problem}"
+    for labels in (config.detections.segmentation_labels, config.detections.category_names):
+        if isinstance(labels, Path) and labels.is_file():
+            try:
+                read_label_map(labels)
+            except UserError as error:
+                yield str(error)
+    # A subject without a file would get the open body, whose mesh differs from the files'.
+    models = config.body_models
     named = [gender for gender in ("female", "male") if getattr(models, gender) is not None]
-    if not named or models.neutral is not None:
-        return
-    for name in project.subjects_named():
+    for name in project.subjects_named() if named else ():
         gender = project.subjects[name].gender
         if models.of(gender) is None:
             yield (
@@ -368,47 +346,24 @@ def _faults_of_bodies(project: Project) -> Iterator[str]:
             )
 
 
-def _faults_of_detectors(project: Project) -> Iterator[str]:
-    """Messages about a detector's model or file of class names that is missing or unreadable."""
-    settings = project.config.detections
-    models = ("segmentation_model", "keypoint_model")
-    for field in (*models, "segmentation_labels", "category_names"):
-        file = getattr(settings, field)
-        if isinstance(file, Path) and not file.is_file():
-            yield (
-                f"{project.path}: detections.{field} is {file}, and there is no such file; correct "
-                "the path"
-            )
-        elif isinstance(file, Path) and field not in models:
-            try:
-                read_label_map(file)
-            except UserError as error:
-                yield str(error)
-
-
 def _faults_of_studio(project: Project, rows: Collection[str], table: Path) -> Iterator[str]:
     """Messages about captures that contradict their row of the table of sequences."""
-    captures = project.config.studio.captures if project.config.studio else {}
-    for sequence in captures:
+    for sequence, capture in project.captures.items():
         if sequence not in rows:
             yield (
                 f"{project.path}: studio.captures names {sequence!r}, which {table} does not "
                 "list; add the row or remove the capture"
             )
-        if sequence not in project.sequences:
-            continue
-        made = project.recordings_made(sequence)
-        given = project.sequences[sequence].recordings
-        layouts = captures[sequence].layout, project.sequences[sequence].layout
-        if layouts[0] != layouts[1]:
+        row, made = project.sequences.get(sequence), project.recordings_made(sequence)
+        if row is not None and row.layout != capture.layout:
             yield (
-                f"{table}: sequence {sequence!r} has layout {layouts[1]!r}, but the studio writes "
-                f"{layouts[0]!r} (studio.captures in {project.path}); make them the same"
+                f"{table}: sequence {sequence!r} has layout {row.layout!r}, but the studio writes "
+                f"{capture.layout!r} (studio.captures in {project.path}); make them the same"
             )
-        if made is not None and made.resolve() != given.resolve():
+        if row is not None and made is not None and made.resolve() != row.recordings.resolve():
             yield (
-                f"{table}: sequence {sequence!r} has recordings {given}, but the studio writes "
-                f"them to {made}; correct the path"
+                f"{table}: sequence {sequence!r} has recordings {row.recordings}, but the studio "
+                f"writes them to {made}; correct the path"
             )
 
 
@@ -430,39 +385,26 @@ def tidy(path: Path, folder: Path | None = None) -> Path:
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
-def _or_empty(values: Any) -> Any:
-    """Contents of a YAML file; an empty file has no entries."""
-    return {} if values is None else values
+def _read_mapping(path: Path, expected: str, advice: str) -> dict[Any, Any]:
+    """Names and values of a YAML file; {} for an empty file."""
+    values = read_yaml(path)
+    if not isinstance(values, dict | None):
+        raise UserError(f"{path}: expected {expected}, found {type(values).__name__}; {advice}")
+    return values or {}
 
 
 def _read_objects(path: Path, settings: Path, faults: list[str]) -> dict[str, ObjectEntry | None]:
     """Read the objects file: entries by name with resolved paths, None for faulty ones."""
-    if not path.exists():
-        faults.append(
-            f"{path}: there is no such file; check the path 'objects' in the settings, {settings}"
-        )
-        return {}
     try:
-        values = _or_empty(read_yaml(path))
+        values = _read_mapping(path, "object names and entries", "correct it")
     except UserError as error:
-        faults.append(str(error))
-        return {}
-    if not isinstance(values, dict):
-        faults.append(
-            f"{path}: expected object names and entries, found {type(values).__name__}; correct it"
-        )
+        faults.append(f"{error}; {settings} names this file in the setting objects")
         return {}
     objects: dict[str, ObjectEntry | None] = {}
     for name, entry in values.items():
-        where = f"{path}, object {quoted(name)}"
-        if not isinstance(entry, dict | None):
-            faults.append(
-                f"{where}: expected fields such as 'mesh: cup.ply', found {quoted(entry)}; correct "
-                "it"
-            )
-            objects[name] = None
-            continue
-        fields = {"name": name, **(entry or {})}
+        where, fields = f"{path}, object {quoted(name)}", entry
+        if isinstance(entry, dict | None):
+            fields = {"name": name, **(entry or {})}
         parsed = parse_entry(ObjectEntry, fields, where, "field", faults)
         objects[name] = None if parsed is None else _absolute(parsed, path.parent)
     return objects

@@ -42,16 +42,16 @@ def parse_entry(model: type[M], values: Any, where: str, what: str, faults: list
 
     Args:
         model: the model.
-        values: names and values.
+        values: names and values; None = there are none.
         where: place of the entry, for messages.
         what: kind of a field, such as "setting".
         faults: gets one message for each fault.
     """
-    if not isinstance(values, dict):
+    if not isinstance(values, dict | None):
         faults.append(f"{where}: expected names and values, found {quoted(values)}; correct it")
         return None
     try:
-        return model.model_validate(values)
+        return model.model_validate(values or {})
     except ValidationError as error:
         faults += describe(error, model, where, what)
         return None

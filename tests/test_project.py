@@ -114,7 +114,7 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
     (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
     (
         settings("dataset: x\njoint: {lemo: LEMO}\n"),
-        ["config.yaml", "joint.lemo", "LEMO/runs/15217/Enc_last_model.pkl", "no file"],
+        ["config.yaml", "joint.lemo", "LEMO/runs/15217/Enc_last_model.pkl", "no such file"],
     ),
     (
         settings("dataset: x\njoint: {contact_to: annotated}\n"),

@@ -8,16 +8,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from logging.handlers import BufferingHandler
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import describe_unread, list_files
+from intercap_core.inputs.files import describe_unread, list_files, name_some
 from intercap_core.project import Project, read_project, tidy
-
-if TYPE_CHECKING:
-    from intercap_core.commands.check_recordings import RecordingFindings
-    from intercap_core.config import BodyModels
 
 
 @dataclass(frozen=True)
@@ -42,38 +37,27 @@ def check_bodies(project: Project) -> None:
         check()
 
 
-def _body_checks(project: Project) -> list[Callable[[], None]]:
+def _body_checks(project: Project) -> list[Callable[[], object]]:
     """A check for each body file and prior that exists; missing files are faults already."""
     models, lemo = project.config.body_models, project.config.joint.lemo_files or ()
     genders = {project.subjects[name].gender for name in project.subjects_named()}
     files = sorted({path for gender in genders if (path := models.of(gender)) is not None})
-    checks: list[Callable[[], None]]
-    checks = [partial(_check_body, path) for path in files if path.is_file()]
-    if models.vposer is not None and models.vposer.is_file():
-        checks.append(partial(_check_pose_prior, models))
-    if lemo and all(path.is_file() for path in lemo):
-        checks.append(partial(_check_motion_prior, lemo))
-    return checks
-
-
-# These import torch.
-def _check_body(path: Path) -> None:
+    if not files and not lemo and models.vposer is None:
+        return []  # without the import of torch
+    from intercap_core.body.artefact import load_pose_prior
+    from intercap_core.body.lemo import MotionEncoder
     from intercap_core.body.model import BodyModel, check_body
 
-    check_body(BodyModel.load(path))
+    def check_file(path: Path) -> None:
+        check_body(BodyModel.load(path))
 
-
-def _check_pose_prior(models: BodyModels) -> None:
-    from intercap_core.body.artefact import load_pose_prior
-    from intercap_core.body.model import BodyModel
-
-    load_pose_prior(models, BodyModel.load())
-
-
-def _check_motion_prior(files: tuple[Path, Path]) -> None:
-    from intercap_core.body.lemo import MotionEncoder
-
-    MotionEncoder.load(*files)
+    checks: list[Callable[[], object]]
+    checks = [partial(check_file, path) for path in files if path.is_file()]
+    if models.vposer is not None and models.vposer.is_file():
+        checks.append(lambda: load_pose_prior(models, BodyModel.load()))
+    if lemo and all(path.is_file() for path in lemo):
+        checks.append(lambda: MotionEncoder.load(*lemo))
+    return checks
 
 
 def check_keypoint_model(project: Project) -> None:
@@ -93,7 +77,6 @@ def check_segmentation_model(project: Project) -> list[Fault]:
     settings = project.config.detections
     if settings.segmentation_model is None or not settings.segmentation_model.is_file():
         return []
-    from intercap_core.commands.check_recordings import list_labels
     from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     classes = Segmenter.load(settings).classes
@@ -101,7 +84,7 @@ def check_segmentation_model(project: Project) -> list[Fault]:
         Fault(
             "",
             f"{settings.segmentation_model}: none of its {len(classes)} classes "
-            f"({list_labels(classes)}) is a label of object {name!r} "
+            f"({name_some(classes, 8)}) is a label of object {name!r} "
             f"({', '.join(project.objects[name].labels)}); add the label to objects.yaml, or name "
             "the model's classes in detections.segmentation_labels",
         )
@@ -126,22 +109,19 @@ class Findings:
     ready: int = 0
     """Number of the sequences that can run."""
 
-    def add(self, sequence: str, found: RecordingFindings) -> None:
-        """Add the findings on the recordings of a sequence."""
-        self.faults += [Fault(sequence, message) for message in found.faults]
-        self.notes += [Fault(sequence, message) for message in found.notes]
-        self.summaries += [Fault(sequence, found.summary)] if found.summary else []
-
 
 def check_project(settings: Path) -> Findings:
     """Check settings, tables, the files that they name, and all sequences, in one pass."""
     project, faults = read_project(settings)
     findings = Findings([Fault("", message) for message in faults])
     findings.sequences = len(project.listed - set(project.config.exclude))
-    checks = [partial(check, project) for check in (check_keypoint_model, check_segmentation_model)]
-    for check in (*_body_checks(project), *checks):
+    detectors = [
+        lambda: check_keypoint_model(project),
+        lambda: findings.notes.extend(check_segmentation_model(project)),
+    ]
+    for check in (*_body_checks(project), *detectors):
         try:
-            findings.notes += check() or []
+            check()
         except UserError as error:
             if str(error) not in faults:
                 findings.faults.append(Fault("", str(error)))
@@ -195,10 +175,19 @@ def check_sequences(project: Project) -> Findings:
         mesh = meshes.get(row.object or "")
         if mesh is not None:
             faults.append(Fault(name, mesh))
-        if project.recordings_made(name) is not None:
-            faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
+        studio = project.config.studio
+        if studio is not None and name in studio.captures:
+            from intercap_core.studio.stage import check_capture
+
+            try:
+                check_capture(studio.captures[name], studio, row.object)
+            except UserError as error:
+                faults.append(Fault(name, f"{project.path}: {error}"))
             continue
-        findings.add(name, check_row(project, row))
+        found = check_row(project, row)
+        faults += [Fault(name, message) for message in found.faults]
+        findings.notes += [Fault(name, message) for message in found.notes]
+        findings.summaries += [Fault(name, found.summary)] if found.summary else []
     return findings
 
 
@@ -251,16 +240,3 @@ def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:
         mesh.log.propagate = True
     findings.notes += [Fault("", record.getMessage()) for record in warnings.buffer]
     return None
-
-
-def _faults_of_capture(project: Project, name: str) -> list[str]:
-    """Error message if the studio cannot make the recording; [] otherwise."""
-    from intercap_core.studio.stage import check_capture
-
-    settings = project.config.studio
-    assert settings is not None
-    try:
-        check_capture(settings.captures[name], settings, project.sequences[name].object)
-    except UserError as error:
-        return [f"{project.path}: {error}"]
-    return []

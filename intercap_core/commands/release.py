@@ -12,6 +12,7 @@ from typing import Any
 from intercap_core import schemas
 from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
+from intercap_core.inputs.files import name_some
 from intercap_core.output.release import manifest
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.pipeline.plan import OutputStatus, Plan
@@ -106,9 +107,8 @@ def _check_complete(project: Project) -> None:
     for name, found in broken.items():
         log.warning("%s: %s", name, "; ".join(found))
     names = sorted(broken)
-    more = f" and {len(names) - _PRINTED} more" if len(names) > _PRINTED else ""
     raise UserError(
-        f"{project.results}: outputs of {', '.join(names[:_PRINTED])}{more} are damaged or "
+        f"{project.results}: outputs of {name_some(names, _PRINTED)} are damaged or "
         f"missing, such as {broken[names[0]][0].partition(';')[0]}; nothing is released: run the "
         "project again, or name the sequences in 'exclude'"
     )

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from intercap_core.commands.console import ListTable, counted, standard_console
-from intercap_core.inputs.files import printable
+from intercap_core.inputs.files import name_some, printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.plan import OutputState, OutputStatus, Plan
@@ -160,8 +160,7 @@ def _reasons(current: Status) -> list[str]:
     for (state, stage, words), names in sorted(
         sequences.items(), key=lambda item: (order.index(item[0][0]), -len(item[1]))
     ):
-        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-        lines.append(f"{stage} {state} in {', '.join(names[:6])}{more}: {words}")
+        lines.append(f"{stage} {state} in {name_some(names, 6)}: {words}")
     return lines
 
 

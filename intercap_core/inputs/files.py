@@ -7,7 +7,7 @@ import os
 import re
 import reprlib
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -178,6 +178,12 @@ def quoted(value: Any, most: int = 80) -> str:
 def printable(text: str) -> str:
     """Replace characters that UTF-8 cannot encode, such as bytes of file names, by ``?``."""
     return text.encode("utf-8", "replace").decode("utf-8", "replace")
+
+
+def name_some(names: Sequence[str], most: int) -> str:
+    """The first ``most`` names as text, with the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def parse_numbers(value: Any, where: str, field: str) -> np.ndarray:

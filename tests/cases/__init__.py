@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.check_recordings import RecordingFindings, check_row
+from intercap_core.commands.check_recordings import RecordingCheck, check_row
 from intercap_core.project import Project, load_project
 from tests.conftest import PROJECT_ROOT
 
@@ -26,5 +26,5 @@ def open_case(name: str, folder: Path) -> Project:
     return load_project(folder / name / "config.yaml")
 
 
-def check(project: Project) -> RecordingFindings:
+def check(project: Project) -> RecordingCheck:
     return check_row(project, project.sequences[SEQUENCE])

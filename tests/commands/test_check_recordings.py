@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
+from intercap_core.commands.check_recordings import RecordingCheck
+from intercap_core.config import DetectionsSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
 from tests.helpers.kinect_files import entry_of, record
@@ -41,9 +42,11 @@ def write_video(path: Path, count: int = COUNT, size: tuple[int, int] = SIZE) ->
         container.mux(stream.encode(None))
 
 
-def look(row: SequenceEntry) -> RecordingFindings:
+def look(row: SequenceEntry) -> RecordingCheck:
     layout = open_layout(row)
-    return check_recordings(row, layout, layout.names)
+    check = RecordingCheck(row, DetectionsSettings())
+    check.check_recordings(layout, layout.names)
+    return check
 
 
 def cut(path: Path, share: float = 0.1) -> None:
@@ -139,7 +142,7 @@ def test_a_faulty_folder_of_images_is_reported(
 def test_summary_of_a_good_sequence(images: SequenceEntry) -> None:
     assert look(images).summary == (
         "2 cameras; 96x64; 40 images; 3.9 s; no depth; keypoints of 2; "
-        "segmentation masks (candidates) of 2"
+        "segmentation masks (candidates) of 2; images: by number"
     )
 
 
