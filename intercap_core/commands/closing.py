@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from intercap_core.commands.console import print_plain
 from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import warnings_of
@@ -90,7 +91,7 @@ def print_remarks(project: Project, console: Console) -> None:
     left = len(blocks) - MAX_SEQUENCES
     printed = _text([*head, *blocks[:MAX_SEQUENCES]])
     more = f"{left} more sequences, and all remarks" if left > 0 else "all remarks"
-    console.print(f"{printed}{more}: {path}", highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, f"{printed}{more}: {path}")
 
 
 def _text(blocks: Sequence[Sequence[str]]) -> str:

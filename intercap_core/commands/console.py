@@ -25,6 +25,11 @@ def standard_console() -> Console:
     return Console(width=None if sys.stdout.isatty() else UNLIMITED)
 
 
+def print_plain(console: Console, text: str) -> None:
+    """Print text without markup, highlighting and line breaks."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
 class ListTable(Table):
     """Table without borders that never truncates a cell.
 

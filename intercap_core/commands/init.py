@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 
-from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.console import ListTable, print_plain, standard_console
 from intercap_core.config_types import Name
 from intercap_core.errors import UserError
 from intercap_core.tables import behave, intercap, own
@@ -89,7 +89,7 @@ def print_draft(draft: Draft, root: Path) -> None:
     console = standard_console()
     console.print(table)
     for remark in draft.all_remarks():
-        console.print(remark, highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, remark)
 
 
 def _cells(columns: dict[str, str | Path], cameras: list[str], root: Path) -> Iterator[str]:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from intercap_core import artefacts, schemas
-from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.commands.console import ListTable, print_plain, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
 
@@ -71,7 +71,7 @@ def _print_texts(source: artefacts.Artefact, key: str, console: Console) -> None
         console.print(f"[bold]{escape(key)}[/bold]", highlight=False)
     shown = 30
     for line in lines[:shown]:
-        console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"  {line}")
     if len(lines) > shown:
         console.print(f"  ... and {len(lines) - shown} more", highlight=False)
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from rich.markup import escape
 
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
-from intercap_core.commands.console import ListTable
+from intercap_core.commands.console import ListTable, print_plain
 from intercap_core.disk import free_bytes
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
@@ -75,25 +76,38 @@ def run_workflow(
     if find_spec("snakemake") is None:
         raise UserError("runs need Snakemake: pip install 'intercap-core[workflow]'")
     console = Console(stderr=True)
+    command = partial(snakemake_command, project, cores=cores, profile=profile)
     if DRY_RUN & set(arguments):
-        command = snakemake_command(project, cores=cores, profile=profile, arguments=arguments)
-        return subprocess.call(command, cwd=project.root)
+        return subprocess.call(command(arguments=arguments), cwd=project.root)
     if not arguments and Plan(project).all_done():
         count = len(project.sequences)
-        console.print(f"nothing to do: all {count} sequences are done", highlight=False)
+        print_plain(console, f"nothing to do: all {count} sequences are done")
         _print_report(project, console)
         return 0
     with _exclusive(project, console):
-        return _run(project, cores, profile, arguments, console)
+        return _run(project, command, arguments, console)
 
 
 @contextmanager
 def _exclusive(project: Project, console: Console) -> Iterator[None]:
-    """Prevent a second run of the same results.
+    """Prevent a second run of the same results; wait until a lease without a heartbeat expires.
 
-    Raises UserError that names the other run if there is one.
+    Raises UserError that names the other run as soon as it gives a heartbeat.
     """
-    lease = _acquire_run_lease(project, console)
+    path = lease_path(project.results / "run")
+    first_beat = None
+    while not isinstance(lease := try_acquire(path), Lease):
+        with contextlib.suppress(FileNotFoundError):
+            beat = path.stat().st_mtime_ns
+            if first_beat is None:
+                first_beat = beat
+                print_plain(console, f"waiting for a heartbeat of the run by {lease}")
+            elif beat != first_beat:
+                raise UserError(
+                    f"{project.results}: another run is active ({lease}); wait for its end, or "
+                    "end it"
+                )
+        time.sleep(POLL_SECONDS)
     try:
         killed = lease.expired_owner
         if killed is not None and killed.host == socket.gethostname():
@@ -111,57 +125,28 @@ def _exclusive(project: Project, console: Console) -> Iterator[None]:
         lease.release()
 
 
-def _acquire_run_lease(project: Project, console: Console) -> Lease:
-    """The lease of the run; waits until a lease without a heartbeat expires.
-
-    Raises UserError as soon as another run gives a heartbeat.
-    """
-    path = lease_path(project.results / "run")
-    first_beat = None
-    while True:
-        lease = try_acquire(path)
-        if isinstance(lease, Lease):
-            return lease
-        with contextlib.suppress(FileNotFoundError):
-            beat = path.stat().st_mtime_ns
-            if first_beat is None:
-                first_beat = beat
-                console.print(f"waiting for a heartbeat of the run by {lease}", highlight=False)
-            elif beat != first_beat:
-                raise UserError(
-                    f"{project.results}: another run is active ({lease}); wait for its end, or "
-                    "end it"
-                )
-        time.sleep(POLL_SECONDS)
-
-
 def _run(
-    project: Project,
-    cores: int,
-    profile: Path | None,
-    arguments: Sequence[str],
-    console: Console,
+    project: Project, command: Callable[..., list[str]], arguments: Sequence[str], console: Console
 ) -> int:
     """Run Snakemake until nothing is stale, print failures and remarks; returns the exit status.
 
     If some sequences fail, the outputs of all sequences are made from the others.
     """
-    command = snakemake_command(project, cores=cores, profile=profile, arguments=arguments)
     watcher = Watcher(project, console)
     try:
-        status = run_watched(command, watcher, console)
+        status = run_watched(command(arguments=arguments), watcher, console)
         # Snakemake ignores the marks of jobs downstream of a job that it runs
         # (DAG.update_needrun). If that job writes an unchanged output, stale outputs downstream
         # need another start.
         while status == 0 and not arguments and not watcher.idle and not Plan(project).all_done():
             watcher = Watcher(project, console)
-            status = run_watched(command, watcher, console)
+            status = run_watched(command(), watcher, console)
     except Terminated as end:
-        words = f"{end}: {watcher.steps()} jobs are done; run the same command to continue"
-        console.print(words, highlight=False, soft_wrap=True)
+        steps = watcher.steps()
+        print_plain(console, f"{end}: {steps} jobs are done; run the same command to continue")
         printed = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
         for line in dict.fromkeys(line for line in printed if line.startswith(GO_ON)):
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            print_plain(console, line)
         raise SystemExit(end.status) from None
     failures = watcher.print_failures(failed=bool(status))
     if status and not failures:
@@ -173,12 +158,11 @@ def _run(
         if not all(project.artefact(name, stage).exists() for stage in DATASET_READS)
     )
     if bad and len(bad) < len(project.sequences) and not arguments:
-        console.print(f"the report leaves out {', '.join(bad)}", highlight=False, markup=False)
+        print_plain(console, f"the report leaves out {', '.join(bad)}")
         targets = [project.target(project.results / name) for name in AGGREGATES]
         excluded = ",".join([*project.config.exclude, *bad])
         others = [*targets, "--config", f"exclude=[{excluded}]"]
-        command = snakemake_command(project, cores=cores, profile=profile, arguments=others)
-        run_watched(command, Watcher(project, console), console)
+        run_watched(command(arguments=others), Watcher(project, console), console)
     print_remarks(project, console)
     _print_report(project, console)
     return status
@@ -195,8 +179,7 @@ def _full_disk(project: Project) -> str:
 def _print_report(project: Project, console: Console) -> None:
     report = project.site / "index.html"
     if report.is_file():
-        words = f"report: {report.resolve()}"
-        console.print(words, highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"report: {report.resolve()}")
 
 
 def snakemake_command(
@@ -239,9 +222,7 @@ class Watcher:
         self._started = time.time() - 1.0  # some file systems store whole seconds
         self._printed: set[str] = set()
         self._printed_at = time.monotonic()
-        self._logs = project.logs
-        self._root = project.root
-        self.transcript = self._logs / "snakemake.log"
+        self.transcript = project.logs / "snakemake.log"
 
     def start(
         self, command: Sequence[str], *, pass_fds: Sequence[int] = ()
@@ -254,7 +235,7 @@ class Watcher:
                 command,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                cwd=self._root,
+                cwd=self._project.root,
                 env={**os.environ, "NO_COLOR": "1"},
                 pass_fds=pass_fds,
             )
@@ -262,54 +243,51 @@ class Watcher:
     def jobs(self) -> dict[str, JobState]:
         """State of every job that this run has started, by "sequence: stage"."""
         found = {}
-        for path in sorted(self._logs.glob("**/*.log")):
+        logs = self._project.logs
+        for path in sorted(logs.glob("**/*.log")):
             try:
                 if path == self.transcript or path.stat().st_mtime < self._started:
                     continue
                 state = JobState(*read_state(path), path)
             except FileNotFoundError:  # Snakemake removes an old log before it starts a job
                 continue
-            sequence = path.parent.name if path.parent != self._logs else ""
+            sequence = path.parent.name if path.parent != logs else ""
             found[f"{sequence}: {path.stem}" if sequence else path.stem] = state
         return found
 
-    def failures(self) -> dict[str, str]:
-        """Reason by job that did not finish; valid after the run has ended."""
+    def print_failures(self, *, failed: bool, prefix: str = "") -> dict[str, str]:
+        """Print and return the reason by job that did not finish; valid after the run has ended.
+
+        If the run failed without such a job, print its last lines.
+        """
         why = _full_disk(self._project) or "killed, perhaps for its memory"
         ended = f"ended without a log entry: {why}"
-        return {
+        failures = {
             name: job.words if job.state == "failed" else ended
             for name, job in self.jobs().items()
             if job.state != "finished"
         }
-
-    def print_failures(self, *, failed: bool, prefix: str = "") -> dict[str, str]:
-        """Print and return the failures; if the run failed without one, print its last lines."""
-        failures = self.failures()
         for name, words in failures.items():
             line = f"[red]{escape(prefix + name)}[/red] {escape(words)}"
             self._console.print(line, highlight=False, soft_wrap=True)
         if failed and not failures:
             lines = self.transcript.read_text(encoding="utf-8").splitlines()
-            self._console.print("\n".join(lines[-15:]), highlight=False, markup=False)
+            print_plain(self._console, "\n".join(lines[-15:]))
         return failures
 
     def table(self) -> Group:
         """Table of the sequences with running or failed jobs, by stage, and counts of all."""
         jobs = self.jobs()
-        of_sequence: dict[str, list[str]] = {name: [] for name in self._project.sequences}
+        states: dict[str, set[str]] = {name: set() for name in self._project.sequences}
         for name, job in jobs.items():
-            if name.partition(":")[0] in of_sequence:
-                of_sequence[name.partition(":")[0]].append(job.state)
-        ended = {name for name, states in of_sequence.items() if set(states) == {"finished"}}
-        order = {"running": 0, "failed": 1}
-        shown = sorted(
-            (name for name, states in of_sequence.items() if set(states) & set(order)),
-            key=lambda name: min(order.get(state, 2) for state in of_sequence[name]),
-        )
-        waiting = sum(not states for states in of_sequence.values())
+            states.get(name.partition(":")[0], set()).add(job.state)
+        ended = sum(of_jobs == {"finished"} for of_jobs in states.values())
+        waiting = sum(not of_jobs for of_jobs in states.values())
+        running = [name for name, of_jobs in states.items() if "running" in of_jobs]
+        failed = [name for name, of_jobs in states.items() if "failed" in of_jobs]
+        shown = list(dict.fromkeys([*running, *failed]))
         counts = (
-            f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} are finished, "
+            f"{self.steps()} jobs done; of {len(states)} sequences {ended} are finished, "
             f"{waiting} are waiting or up to date"
         )
         table = ListTable("sequence", *STAGES)
@@ -340,11 +318,10 @@ class Watcher:
         for name, job in jobs.items():
             if job.state != "running" and name not in self._printed:
                 self._printed.add(name)
-                words = f"{name}: {job.state} {job.words}"
-                self._console.print(words, highlight=False, markup=False, soft_wrap=True)
+                print_plain(self._console, f"{name}: {job.state} {job.words}")
         if time.monotonic() - self._printed_at >= 30.0:
             self._printed_at = time.monotonic()
-            self._console.print(self.progress(), highlight=False, markup=False, soft_wrap=True)
+            print_plain(self._console, self.progress())
 
     def progress(self) -> str:
         """Number of finished jobs, and the last log line of each running job."""
