@@ -49,7 +49,7 @@ class Progress:
         if elapsed <= 0.0:
             return line
         rate = self._count / elapsed
-        line += f", {rate:.3g} a second"
+        line += f", {rate:.3g} a second" if rate >= 1.0 else f", {1.0 / rate:.3g} s each"
         if self._of is not None and 0 < self._count < self._of:
             line += f", {(self._of - self._count) / rate:.0f} s to go"
         return line

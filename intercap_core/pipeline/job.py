@@ -68,7 +68,7 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     logger.setLevel(logging.INFO)
     logger.addHandler(handler)
     start = time.monotonic()
-    logger.info("%s started with %d thread(s)", name, threads)
+    logger.info("started, threads: %d", threads)
     try:
         with raise_on_signals():
             yield
