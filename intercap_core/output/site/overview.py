@@ -178,7 +178,7 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     inside = {part: f"; {n} of {all_} true errors in range"
               for part, n, all_ in measures.covered(measured)}  # fmt: skip
     tiles += [
-        tile(f"{part}, estimated error", value, "mm", f"no ground truth{inside.get(part, '')}")
+        tile(f"{part}, estimated error", value, "mm", f"without ground truth{inside.get(part, '')}")
         for part, value in mean_stated(measured).items()
     ]
     handling = any(s.has_object for s in measured)

@@ -114,7 +114,7 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
             f"{error.part}, estimated error",
             error.stated,
             "mm",
-            error.silent or f"no ground truth; range {measures.error_range(error)} mm",
+            error.silent or f"without ground truth; range {measures.error_range(error)} mm",
         )
         for error in stated_errors(s)
     ]
