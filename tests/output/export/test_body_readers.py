@@ -142,14 +142,14 @@ def test_columns_beyond_the_parameters_are_zero(
     betas: int, expression: int, tmp_path: Path
 ) -> None:
     body = ExportBody(OPEN_BODY, "neutral", 13492, betas, expression)
-    written = {file.name: file for file in body_files.write(tmp_path / "body", body)}
+    written = body_files.write(tmp_path / "body", body)
     with np.load(OPEN_BODY) as file:
         table = file["shapedirs"]
     with np.load(tmp_path / "body" / FULL) as file:
         columns = file["shapedirs"]
     np.testing.assert_array_equal(columns[..., :betas], table[..., :betas])
     assert not columns[..., betas:300].any() and not columns[..., 300 + expression :].any()
-    assert written[FULL].betas == f"0:{betas}"
+    assert written[FULL]["betas"] == f"0:{betas}"
 
 
 def test_a_licensed_body_file_is_not_exported(tmp_path: Path) -> None:
