@@ -41,8 +41,8 @@ from intercap_core.joint.terms.term import TermContext
 # Steps that the rounds accept at most. A second step in the later rounds changes errors by less
 # than 0.03 mm, twice as many steps in the first by less than 0.1 mm (bench/RESULTS.md).
 ROUND_STEPS = (6, 1, 1, 1)
-# Displacement of body and object over a round, metres: a smaller one ends the fit. A tenth of the
-# errors of the fit.
+# Displacement of body and object over a round, metres: a smaller one ends the fit. A seventh of the
+# body's mean error and half of the object's, measured on the studio (bench/RESULTS.md).
 UNCHANGED_M = 0.001
 
 log = logging.getLogger(__name__)
@@ -213,7 +213,7 @@ class _Rounds:
         changed_m = _displacement(self._geometry, self._last, self.state)
         self._last = self.state
         contact_change = self.estimate.change(previous)
-        # a tenth of the probability; tuned on the studio
+        # the limit of the contact probability is tuned on the studio
         self._unchanged = settled and changed_m < UNCHANGED_M and contact_change < 0.1
 
     def correct_cameras(self, cameras: CameraFit) -> None:

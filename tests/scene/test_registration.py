@@ -134,8 +134,8 @@ def test_nearest_points_are_those_of_all_pairs():
     assert 0 < (expected < 0).sum() < len(sought)
     np.testing.assert_array_equal(NearestPoints(points, layer, 0.3).query(sought, own), expected)
     alone = NearestPoints(points[:1], 0, 0.3)
-    beside = points[:1] + np.array([[0.2, 0, 0], [0.4, 0, 0]])
-    np.testing.assert_array_equal(alone.query(beside, 0), [0, -1])
+    offset_points = points[:1] + np.array([[0.2, 0, 0], [0.4, 0, 0]])
+    np.testing.assert_array_equal(alone.query(offset_points, 0), [0, -1])
 
 
 @pytest.mark.parametrize("seed", range(3))
