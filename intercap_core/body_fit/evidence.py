@@ -91,7 +91,7 @@ class Evidence:
     :mod:`.surface` defines the S samples of the skin and the G coverings.
 
     Attributes:
-        frames: (N,) indices of the usable frames in the sequence.
+        frames: (N,) indices of the usable frames among the observed ones.
         keypoint_sigma: (135,) standard deviation of a keypoint of median confidence, metres.
         keypoint_doubt: (135,) exponent a: sigma is proportional to confidence^-a.
         cloud_noise: (G,) standard deviation of a sample's mean distance, by covering, metres.
@@ -106,10 +106,20 @@ class Evidence:
         observations: Observations,
         clouds: list[PersonCloud | None],
         cloud_weight: float,
+        window: slice | None = None,
     ) -> None:
+        """Take the observations of a sequence, of the frames ``window`` only if one is given.
+
+        ``clouds`` are those of the window. Which frames are usable, and the median confidence of
+        keypoints, follow from the whole sequence.
+        """
         self.model, self.cloud_weight = model, cloud_weight
+        usable = observations.usable
+        median_confidence = _median_confidence(observations.confidence[usable])
+        if window is not None:
+            observations, usable = observations.window(window), usable[window]
         self.observations = observations
-        self.frames = np.flatnonzero(observations.usable)
+        self.frames = np.flatnonzero(usable)
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = choose_samples(model)
@@ -131,12 +141,9 @@ class Evidence:
         self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
-        self.median_confidence = torch.ones_like(self.keypoint_sigma)
+        self.median_confidence = self._tensor(median_confidence)
         for part, value in KEYPOINT_SIGMA_M:
             self.keypoint_sigma[part] = value
-            confidence = observations.confidence[self.frames, :, part]
-            detected = confidence[confidence > 0]
-            self.median_confidence[part] = float(np.median(detected)) if len(detected) else 1.0
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype)
@@ -394,3 +401,16 @@ class Evidence:
         weight = share * total / (total + 2.0) / noise**2
         target = mean + (by_view.normal * by_view.where).sum(2)
         return CloudRows(target, by_view.normal, weight)
+
+
+def _median_confidence(confidence: np.ndarray) -> np.ndarray:
+    """Return the median (K,) of confidences (N, C, K) above 0, one for each part of the body.
+
+    1 for a part that is never detected.
+    """
+    median = np.ones(NUM_KEYPOINTS)
+    for part, _ in KEYPOINT_SIGMA_M:
+        detected = confidence[..., part][confidence[..., part] > 0]
+        if len(detected):
+            median[part] = np.median(detected)
+    return median

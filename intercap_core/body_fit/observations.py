@@ -84,9 +84,23 @@ class Observations:
         placed = self.placed
         if not placed.any():
             return placed
-        gap = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
+        near = self.times[placed]
+        after = np.searchsorted(near, self.times).clip(1, max(len(near) - 1, 1))
+        gap = np.abs(self.times - near[np.stack([after - 1, after % len(near)])]).min(0)
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
         return placed | ((gap <= 1.0) & (known >= 6))
+
+    def window(self, frames: slice) -> Observations:
+        """Return the observations of some frames."""
+        cameras = len(self.rig)
+        images = slice(frames.start * cameras, frames.stop * cameras)
+        by_frame = ("keypoints", "confidence", "joints", "joint_views", "mask_source")
+        return replace(
+            self,
+            masks=self.masks[images],
+            other_masks=self.other_masks[images],
+            **{name: getattr(self, name)[frames] for name in (*by_frame, "image_of", "times")},
+        )
 
 
 def read_observations(scene: Path, person: Path) -> Observations:
@@ -193,12 +207,18 @@ class PersonCloud:
         return replace(self, points=points, normals=normals)
 
 
-def person_clouds(frames: Path, observations: Observations, count: int) -> list[PersonCloud | None]:
-    """Return the cloud of each frame, of about ``count`` points; None = no usable mask."""
+def person_clouds(
+    frames: Path, observations: Observations, count: int, moments: slice = slice(None)
+) -> list[PersonCloud | None]:
+    """Return the clouds of the frames ``moments``, of about ``count`` points each.
+
+    None = no usable mask.
+    """
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
         return ThreadPool(threads_of_job()).map(
-            lambda t: _fuse(reader, observations, t, count), range(observations.num_frames)
+            lambda t: _fuse(reader, observations, t, count),
+            range(observations.num_frames)[moments],
         )
 
 

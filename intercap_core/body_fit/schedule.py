@@ -105,6 +105,7 @@ class Fitter:
         settings: settings of the stage.
         pose_prior: learned prior of the body pose; None = the open prior.
         definition: prior of the keypoint offsets; None = unknown.
+        window: the frames to use; None = all. ``clouds`` are those of the window.
     """
 
     def __init__(
@@ -115,11 +116,12 @@ class Fitter:
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
         definition: Definition | None = None,
+        window: slice | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
         self.definition = definition or Definition.unknown()
         self._progress = Progress(log, "body: minimised", None, "rounds")
-        self.evidence = Evidence(model, observations, clouds, settings.cloud_weight)
+        self.evidence = Evidence(model, observations, clouds, settings.cloud_weight, window)
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
 

@@ -18,7 +18,6 @@ from intercap_core.config import JointSettings
 from intercap_core.flags import OF_BODY, OF_OBJECT, PARTS, Cause, Flags
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.contact_estimate import ContactEstimate, estimate_contact
-from intercap_core.joint.floor import contradiction
 from intercap_core.joint.geometry import Geometry, PosedGeometry
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
@@ -59,7 +58,6 @@ class Assembly:
     body: BodyData  # E_B
     object_: ObjectTerm  # E_O
     contact: Contact | None  # E_C; None without an object
-    against_floor: str  # Why the scene's floor is not used; "" if it is, or if there is none
     share: float  # Weight of a frame in the correction of the cameras
 
 
@@ -70,14 +68,13 @@ def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
     the body's terms remain.
     """
     sequential, floor = inputs.sequential, inputs.floor
-    against_floor = contradiction(inputs.geometry, sequential, floor) if floor else ""
     context = TermContext(
         geometry=inputs.geometry,
         settings=settings,
         start=sequential.state,
         trust=sequential.trust,
         fps=inputs.fps,
-        floor=None if against_floor else floor,
+        floor=None if inputs.against_floor else floor,
         encoder=inputs.encoder,
         up=floor.normal if floor else None,
     )
@@ -95,7 +92,6 @@ def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
         body=inputs.body_data,
         object_=object_data,
         contact=context.find(Contact) if inputs.geometry.has_object else None,
-        against_floor=against_floor,
         share=share,
     )
 
@@ -114,8 +110,8 @@ def fit(
     if settings.refine_cameras and not (settings.look_again or alone):
         log.warning("refine_cameras needs look_again: the cameras stay as in scene.h5")
     assembly = assemble(inputs, settings)
-    if assembly.against_floor:
-        log.warning("%s: every frame is flagged; check the scene's ground", assembly.against_floor)
+    if inputs.against_floor:
+        log.warning("%s: every frame is flagged; check the scene's ground", inputs.against_floor)
     cameras = inputs.cameras if (inputs.images or alone) and settings.refine_cameras else None
     rounds = _Rounds(inputs, assembly, partial(estimate_contact, inputs, settings, intervals))
     for number, max_steps in enumerate(ROUND_STEPS, 1):
@@ -150,9 +146,7 @@ def fit(
         steps=rounds.steps,
         refused=rounds.refused,
         convergence=convergence,
-        flags=_flags(
-            inputs, state, rounds.estimate, stalled, against_images, assembly.against_floor
-        ),
+        flags=_flags(inputs, state, rounds.estimate, stalled, against_images),
         cameras_corrected=cameras is not None and not cameras.refused,
         last_step_m=rounds.last_step_m,
         last_decrease=rounds.last_decrease,
@@ -257,14 +251,12 @@ def _flags(
     estimate: ContactEstimate,
     stalled: np.ndarray,
     against_images: np.ndarray,
-    against_floor: str,
 ) -> Flags:
     """Flags of all frames. Only poses that were measured are flagged for penetration.
 
     Args:
         stalled: (T,) frames that no step moved.
         against_images: (T,) frames whose images contradict the object's final pose.
-        against_floor: why the floor is not used.
     """
     flags, every = inputs.sequential.flags, np.ones(len(state), bool)
     deep = sunk = ~every
@@ -293,7 +285,7 @@ def _flags(
         *((frames, reason, ["contact"]) for frames, reason in estimate.doubtful_frames()),
         (stalled, "no step of the joint fit lowered its energy", PARTS),
         (against_images, CONTRADICTED, OF_OBJECT),
-        (every & bool(against_floor), against_floor, PARTS),
+        (every & bool(inputs.against_floor), inputs.against_floor, PARTS),
     ]
     has_object = inputs.geometry.has_object or bool(flags.lost.any())
     return Flags.of(len(state), causes, has_object=has_object)

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.geometry import Geometry, PosedGeometry
 from intercap_core.joint.sequential import SequentialFits
+from intercap_core.joint.state import frame_chunks
 from intercap_core.schemas import CONTACT_REGIONS
 
 _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
@@ -44,19 +45,20 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPl
     with an interpolated body do not count, nor does the object while it is lost.
     """
     tolerance = 0.10  # metres, three times the largest error of sequential fits on the studio
-    posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
-    lowest = floor.heights(posed.skin[:, feet]).min(axis=1)
+    lowest, objects = np.full((2, len(sequential.state)), np.inf)
+    for frames in frame_chunks(len(lowest)):
+        posed = PosedGeometry(geometry, sequential.state.window(frames))
+        lowest[frames] = floor.heights(posed.posed(geometry.skin.vertices[feet])).min(axis=1)
+        if geometry.has_object:
+            objects[frames] = floor.heights(posed.object_vertices).min(axis=1)
     known = ~sequential.flags.filled
     if not known.any():
         return ""
     sunk = float(np.median(lowest[known]))
     if sunk < -tolerance:
         return f"floor {-sunk:.2f} m above the feet, not used"
-    reach = lowest
-    if geometry.has_object:
-        objects = floor.heights(posed.object_vertices).min(axis=1)
-        reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
+    reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
     nearest = float(np.quantile(reach[known], 0.1))
     if nearest > tolerance:
         return f"floor {nearest:.2f} m below feet and object, not used"

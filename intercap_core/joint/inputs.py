@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.lemo import FEWEST_FRAMES, FRAMES_PER_SECOND, MotionEncoder
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.observations import read_observations
 from intercap_core.config import JointSettings
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
@@ -24,10 +26,11 @@ from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
-from intercap_core.joint.floor import FloorPlane
+from intercap_core.joint.floor import FloorPlane, contradiction
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.skin import contact_patches
+from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_images import ObjectImages
 from intercap_core.object_track.recording import ObjectRecording
@@ -39,11 +42,13 @@ from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequenceP
 class JointInputs:
     """The sequential fits of a recording, and the data that they were fitted to."""
 
+    frames: slice  # The T frames of the recording
     geometry: Geometry  # Meshes of body and object
     sequential: SequentialFits  # Body fit and object track
-    body_data: BodyData  # E_B over keypoints and clouds
+    load_body_data: Callable[[State, slice], BodyData]  # Reads E_B of bodies in some frames
     images: ObjectImages | None  # None without an object or without ``look_again``
     floor: FloorPlane | None  # The scene's floor, if it has one
+    against_floor: str  # Why the recording's sequential fits contradict the floor; "" if they don't
     time_offset: np.ndarray  # (C,) the scene's time offsets, seconds
     time_offset_sigma: np.ndarray  # (C,) standard deviations, seconds; NaN if not estimated
     cameras: CameraFit  # The scene's cameras and their covariance
@@ -51,6 +56,25 @@ class JointInputs:
     fps: float  # Frames per second
     threads: ThreadPool  # Threads that compute rows and compare images
     attributes: dict[str, object]  # Sequence, gender and body model of the body fit
+
+    @cached_property
+    def body_data(self) -> BodyData:
+        """E_B over keypoints and clouds, which are read on first use."""
+        return self.load_body_data(self.sequential.state, self.frames)
+
+    def window(self, frames: slice) -> JointInputs:
+        """The inputs of frames ``start`` to ``stop`` of these.
+
+        Data of the body are read anew. What follows from the whole recording stays: usable frames,
+        median confidences, smoothed hands, the contradiction of the floor.
+        """
+        first = self.frames.start
+        return replace(
+            self,
+            frames=slice(first + frames.start, first + frames.stop),
+            sequential=self.sequential.window(frames),
+            images=self.images and self.images.window(frames),
+        )
 
     @property
     def model(self) -> BodyModel:
@@ -84,15 +108,6 @@ def open_inputs(
         sequential = SequentialFits.read(body, track, scene)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
         fps = float(scene.attributes["fps"])
-        body_data = BodyData.load(
-            paths,
-            body,
-            model=model,
-            state=sequential.state,
-            settings=fit_settings.body_fit,
-            fps=fps,
-            pose_prior=load_pose_prior(body_models, model),
-        )
         floor = None
         if scene.attributes["ground_found"]:
             floor = FloorPlane(scene["ground_point"], scene["ground_normal"])
@@ -101,6 +116,22 @@ def open_inputs(
     if sequential.tracked is None:
         mesh = None
     geometry = _geometry(model, mesh, settings)
+    against_floor = contradiction(geometry, sequential, floor) if floor else ""
+    observations = read_observations(paths.scene, paths.person)
+    pose_prior = load_pose_prior(body_models, model)
+
+    def load_body_data(state: State, frames: slice) -> BodyData:
+        return BodyData.load(
+            paths,
+            observations,
+            model=model,
+            state=state,
+            frames=frames,
+            settings=fit_settings.body_fit,
+            fps=fps,
+            pose_prior=pose_prior,
+        )
+
     threads = ThreadPool(threads_of_job())
     # one BLAS thread: small matrix products gain nothing from more, and would block ``threads``
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
@@ -115,11 +146,13 @@ def open_inputs(
             )
             images = ObjectImages(seen, mesh, fit_settings.object_track, object_.labels, threads)
         yield JointInputs(
+            frames=slice(0, len(sequential.state)),
             geometry=geometry,
             sequential=sequential,
-            body_data=body_data,
+            load_body_data=load_body_data,
             images=images,
             floor=floor,
+            against_floor=against_floor,
             time_offset=time_offset,
             time_offset_sigma=time_offset_sigma,
             cameras=cameras,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 
 import numpy as np
@@ -41,6 +41,10 @@ class TrackedPoses:
     resting: np.ndarray  # (T,) frames in which the object rests
     times: np.ndarray  # (T,) seconds
     spread: np.ndarray  # (T, 6) variance added to the images': mesh, ambiguity, interpolation
+
+    def window(self, frames: slice) -> TrackedPoses:
+        """The same of some frames."""
+        return replace(self, **{name: value[frames] for name, value in vars(self).items()})
 
     @classmethod
     def from_track(
@@ -94,6 +98,11 @@ class Trust:
     object_: np.ndarray  # (T,) frames in which the object is tracked
     still: np.ndarray  # (T - 1,) steps to the next frame over which the object rests
 
+    def window(self, frames: slice) -> Trust:
+        """The same of some frames."""
+        steps = slice(frames.start, frames.stop - 1)
+        return Trust(self.body[frames], self.object_[frames], self.still[steps])
+
 
 @dataclass(frozen=True)
 class SequentialFlags:
@@ -105,6 +114,10 @@ class SequentialFlags:
     ambiguous: np.ndarray  # (T,) different poses of the object explain the frame
     carried: np.ndarray  # (T,) the object's pose follows from annotated poses alone
     hands: np.ndarray  # (T, 2) left, right hand is undetermined
+
+    def window(self, frames: slice) -> SequentialFlags:
+        """The same of some frames."""
+        return SequentialFlags(**{name: mask[frames] for name, mask in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -118,6 +131,18 @@ class SequentialFits:
     joint_sigma: np.ndarray  # (T, 55) stated standard deviations of the joints' positions, metres
     hand_sigma: np.ndarray  # (T, 2) those of the smoothed left and right hand, metres
     object_sigma: np.ndarray  # (T,) stated standard deviation of the object's position, metres
+
+    def window(self, frames: slice) -> SequentialFits:
+        """The fits of some frames."""
+        return SequentialFits(
+            state=self.state.window(frames),
+            tracked=None if self.tracked is None else self.tracked.window(frames),
+            trust=self.trust.window(frames),
+            flags=self.flags.window(frames),
+            joint_sigma=self.joint_sigma[frames],
+            hand_sigma=self.hand_sigma[frames],
+            object_sigma=self.object_sigma[frames],
+        )
 
     @classmethod
     def read(cls, body: Artefact, track: Artefact, scene: Artefact) -> SequentialFits:

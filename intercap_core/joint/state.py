@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -37,6 +37,16 @@ class State:
 
     def __len__(self) -> int:
         return len(self.body)
+
+    def window(self, frames: slice) -> State:
+        """The state in some frames."""
+        return replace(
+            self,
+            body=self.body[frames],
+            expression=self.expression[frames],
+            rotation=self.rotation[frames],
+            translation=self.translation[frames],
+        )
 
     def without_object(self) -> State:
         """The same state with NaN poses of the object."""

@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from intercap_core.artefacts import Artefact
+from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
 from intercap_core.body_fit import cloud_term, keypoint_term
 from intercap_core.body_fit.evidence import Evidence
-from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.observations import Observations, person_clouds
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
@@ -35,7 +35,11 @@ from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvide
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import BODY, State
 from intercap_core.joint.terms.term import Equation, JointTerm
+from intercap_core.schemas import BODY_FIT
 from intercap_core.sequence_inputs import SequencePaths
+
+# Datasets of body_fit.h5 with the fields of ``Settled``, in their order.
+_SETTLED = ("keypoint_offsets", "covering", "keypoint_sigma", "covering_noise", "keypoint_doubt")
 
 
 @dataclass(frozen=True)
@@ -68,32 +72,33 @@ class BodyData(JointTerm):
     def load(
         cls,
         paths: SequencePaths,
-        body_fit: Artefact,
+        observations: Observations,
         *,
         model: BodyModel,
         state: State,
+        frames: slice,
         settings: BodyFitSettings,
         fps: float,
         pose_prior: VPoser | None = None,
     ) -> BodyData:
-        """Read the observations, and the constants of the body fit."""
-        observations = read_observations(paths.scene, paths.person)
-        clouds = person_clouds(paths.frames, observations, settings.points_per_frame)
-        fitter = Fitter(model, observations, clouds, settings, pose_prior)
-        names = [
-            "keypoint_offsets",
-            "covering",
-            "keypoint_sigma",
-            "covering_noise",
-            "keypoint_doubt",
-        ]
-        settled = Settled(*(torch.from_numpy(body_fit[name]) for name in names))
+        """Read the clouds of some frames, and the constants of the body fit.
+
+        Args:
+            observations: those of the whole recording.
+            state: bodies in ``frames``.
+            frames: the frames of the recording that count.
+        """
+        with artefacts.read(paths.body_fit, BODY_FIT) as body_fit:
+            settled = Settled(*(torch.from_numpy(body_fit[name]) for name in _SETTLED))
+            failed = body_fit["failed"][frames]
+        clouds = person_clouds(paths.frames, observations, settings.points_per_frame, frames)
+        fitter = Fitter(model, observations, clouds, settings, pose_prior, window=frames)
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
         problem.columns = torch.arange(BODY.stop)
         # a hand's pose lasts 0.5 s (tuned on the studio: 0.3 to 1 are alike)
         lasting = min(fps * 0.5, len(fitter.frames))
         problem.hand_share = 1 / max(lasting, 1.0)
-        return cls(fitter, problem, ~body_fit["failed"])
+        return cls(fitter, problem, ~failed)
 
     def refresh(self, state: State) -> None:
         """Find correspondences and visibility at ``state``."""

@@ -20,6 +20,7 @@ images contradict the pose, stay near the tracked pose, as in :mod:`.object_data
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +48,7 @@ from intercap_core.object_track.evidence import (
 )
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
 from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording, ViewCache
-from intercap_core.object_track.view import FitContext
+from intercap_core.object_track.view import FitContext, View
 from intercap_core.object_track.view_report import ViewReport
 
 
@@ -58,6 +59,7 @@ class ObjectImages:
 
     Attributes:
         recording: images and candidates of the V cameras that have images and a pose.
+        first: index in the recording of frame 0.
         views: cache of the frames' views.
         mesh: simplified mesh of the object.
         context: renderer and settings of the comparison.
@@ -73,12 +75,28 @@ class ObjectImages:
         threads: ThreadPool,
     ) -> None:
         self.recording, self.threads = recording, threads
-        self.views = ViewCache(recording.views, 200_000_000)  # bytes: 22 to 350 frames of 6 cameras
+        self.first = 0
+        self.views = self._cache()
         self.mesh = mesh.simplified(TRACKING_FACES)
         renderer = open_renderer(settings.render_on, threads=1)
         self.context = FitContext(
             self.mesh, labels, settings.min_overlap, settings.background_term, renderer
         )
+
+    def _cache(self) -> ViewCache:
+        """An empty cache; its 200 MB hold 22 to 350 frames of six cameras."""
+        return ViewCache(lambda t: self.recording.views(self.first + t), 200_000_000)
+
+    def view(self, t: int, place: int) -> View:
+        """View of camera number ``place`` of the recording in frame t; not cached."""
+        return self.recording.view(self.first + t, place)
+
+    def window(self, frames: slice) -> ObjectImages:
+        """The images from frame ``frames.start`` on."""
+        window = copy(self)
+        window.first = self.first + frames.start
+        window.views = window._cache()
+        return window
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +260,7 @@ class ObjectImagesData(JointTerm):
 
         def report(t: int) -> ViewReport:
             number = place[int(camera[t])]
-            view = images.recording.view(t, number)
+            view = images.view(t, number)
             return report_at(
                 images.context, view.through(self._geometry[number]), poses[t], twists[t]
             )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
+from intercap_core.body.joints import FIRST_FINGER, NUM_JOINTS
 from intercap_core.config import JointSettings
 from intercap_core.evaluation.verdict.hold_out import (
     HeldOut,
@@ -96,6 +97,34 @@ def test_wrong_camera_has_a_large_held_out_error(
     mine = lie.camera_index == 1
     seen = lie.held_out.keypoint_px[mine, 1], lie.all_cameras.keypoint_px[mine, 1]
     assert np.median(seen[0]) > np.median(seen[1])  # a fit without it does not follow the lie
+
+
+def test_a_window_of_the_inputs_has_the_data_of_its_frames(capture: fitted.Capture) -> None:
+    def compared(inputs: JointInputs, state: State) -> list[np.ndarray]:
+        assembly = assemble(inputs, fitted.FIT_SETTINGS.joint)
+        assembly.body.refresh(state)
+        assembly.object_.refresh(state)
+        reports = sorted((t, c, r.overlap) for t, c, r in assembly.object_.reports())
+        everything = np.ones((len(state), 3, 2), bool)
+        hessian, gradient, _ = assembly.body.linearise_views(everything, state)
+        # priors of the hands count once in half a second, or once in fewer frames
+        fingers = slice(3 * FIRST_FINGER, 3 * NUM_JOINTS)
+        return [
+            np.delete(np.delete(hessian, fingers, 1), fingers, 2),
+            np.delete(gradient, fingers, 1),
+            assembly.body.residuals().keypoint_px,
+            assembly.body.person_by_view(),
+            np.array([overlap for _, _, overlap in reports]).reshape(-1, 3),
+        ]
+
+    frames = slice(2, 5)
+    with _opened(capture) as (inputs, _, result):
+        whole = compared(inputs, result.state)
+        part = compared(inputs.window(frames), result.state.window(frames))
+    whole[-1] = np.vstack([np.full((1, 3), np.nan), whole[-1]])  # the first frame's object is lost
+    for of_all, of_some in zip(whole, part, strict=True):
+        tolerance = 1e-6 * np.nanmax(np.abs(of_all))  # single precision
+        np.testing.assert_allclose(of_some, of_all[frames], rtol=1e-5, atol=tolerance)
 
 
 def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: HeldOut) -> None:
