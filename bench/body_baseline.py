@@ -25,7 +25,8 @@ from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, R
 from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
-from intercap_core.body_fit.observations import Observations, PersonCloud
+from intercap_core.body_fit.clouds import PersonCloud
+from intercap_core.body_fit.observations import Observations
 from intercap_core.evaluation.proximity import seen_by_cameras
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree

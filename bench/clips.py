@@ -19,12 +19,8 @@ from intercap_core.artefacts import read
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.observations import (
-    Observations,
-    PersonCloud,
-    person_clouds,
-    read_observations,
-)
+from intercap_core.body_fit.clouds import PersonCloud, person_clouds
+from intercap_core.body_fit.observations import Observations, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings

@@ -272,7 +272,7 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
 
 BODY_FIT = Schema(
     name="body_fit",
-    version=3,
+    version=4,
     stage="body_fit",
     attributes={
         "sequence": "sequence name",
@@ -327,6 +327,49 @@ BODY_FIT = Schema(
         "covering_noise": Field(
             ("G",), "float32", "standard deviation of the point clouds about each covering", "m"
         ),
+        "cloud_offsets": Field(
+            ("T+1",), "int64", "frame t has the points cloud_offsets[t] to cloud_offsets[t + 1]"
+        ),
+        "cloud_points": Field(
+            ("N", "3"),
+            "float32",
+            "depth points of the person, with the cameras of the scene",
+            "m",
+            "master",
+            codec="none",
+        ),
+        "cloud_normals": Field(
+            ("N", "3"), "float32", "unit normals of the points", "1", "master", codec="none"
+        ),
+        "cloud_edge": Field(("N",), "bool", "the point is at an edge of the depth image"),
+        "cloud_view": Field(("N",), "uint8", "camera of the point"),
+        "cloud_window": Field(
+            ("T", "C", "4"),
+            "int32",
+            "first row, first column, height and width of the depth image around the person; 0 = "
+            "no points",
+            "px",
+        ),
+        "rim_offsets": Field(
+            ("T+1",), "int64", "frame t has the rays rim_offsets[t] to rim_offsets[t + 1]"
+        ),
+        "rim_rays": Field(
+            ("R", "3"),
+            "float32",
+            "unit rays through the rims of the person's masks",
+            "1",
+            "colour camera",
+            codec="none",
+        ),
+        "rim_normals": Field(
+            ("R", "3"),
+            "float32",
+            "outward unit normals of the planes that touch the person along the rays",
+            "1",
+            "colour camera",
+            codec="none",
+        ),
+        "rim_view": Field(("R",), "uint8", "camera of the ray"),
     },
 )
 

@@ -25,8 +25,9 @@ from intercap_core.body.keypoints import (
 )
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import cloud_term, keypoint_term
+from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.matching import Matcher, PosedSkin
-from intercap_core.body_fit.observations import Observations, PersonCloud
+from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
 from intercap_core.body_fit.surface import (

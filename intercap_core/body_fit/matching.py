@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.free_space import find_protruding
-from intercap_core.body_fit.observations import PersonCloud
 from intercap_core.body_fit.outlines import RimSamples, find_touched
 from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.rig import Rig

@@ -26,9 +26,10 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import VPoser
+from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.evidence import Evidence
-from intercap_core.body_fit.observations import Observations, PersonCloud
+from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.quality import PartEvidence, compare_parts
 from intercap_core.body_fit.recover import recover

@@ -18,8 +18,9 @@ from intercap_core.body.loading import OPEN_BODY, ShapePrior, load_body_file
 from intercap_core.body.model import BodyModel, check_body
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, unwrap_turns
+from intercap_core.body_fit.clouds import person_clouds, put_clouds
 from intercap_core.body_fit.definition import Definition
-from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.recover import JUMP_M, measure_jumps
 from intercap_core.body_fit.schedule import BodyFit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
@@ -114,6 +115,7 @@ def run(
         writer.put("keypoint_doubt", fit.settled.keypoint_doubt.numpy())
         writer.put("covering", fit.settled.covering.numpy())
         writer.put("covering_noise", fit.settled.cloud_noise.numpy())
+        put_clouds(writer, clouds, len(seen.rig))
         writer.put("failed", ~fitted)
         writer.put("bridged", ~fitted)
         writer.put("uncertain", stated.uncertain)

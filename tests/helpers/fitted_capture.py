@@ -24,6 +24,8 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.body_fit.clouds import person_clouds, put_clouds
+from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import (
     BodyFitSettings,
@@ -403,6 +405,8 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
             "joint_sigma": np.full((total, 55), 0.01), "part_names": ["left_hand", "right_hand"],
             "keypoint_sigma": np.full(135, 0.01), "covering_noise": np.full(len(COVERINGS), 0.01),
         })  # fmt: skip
+        seen = read_observations(capture.paths["scene"], capture.paths["person"])
+        put_clouds(writer, person_clouds(capture.paths["frames"], seen, 3000), count)
         fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
         capture.paths["joint"], JOINT, object=object_name, iterations=3, refused=0,

@@ -11,7 +11,8 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.clouds import person_clouds
+from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.body_fit.surface import COVERINGS

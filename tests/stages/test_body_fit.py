@@ -17,7 +17,8 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle, vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.clouds import person_clouds
+from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.surface import COVERINGS, choose_samples

@@ -24,8 +24,9 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
 from intercap_core.body_fit import cloud_term, keypoint_term
+from intercap_core.body_fit.clouds import read_clouds
 from intercap_core.body_fit.evidence import Evidence
-from intercap_core.body_fit.observations import Observations, person_clouds
+from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
@@ -91,7 +92,7 @@ class BodyData(JointTerm):
         with artefacts.read(paths.body_fit, BODY_FIT) as body_fit:
             settled = Settled(*(torch.from_numpy(body_fit[name]) for name in _SETTLED))
             failed = body_fit["failed"][frames]
-        clouds = person_clouds(paths.frames, observations, settings.points_per_frame, frames)
+        clouds = read_clouds(paths.body_fit, paths.frames, observations.image_of, frames)
         fitter = Fitter(model, observations, clouds, settings, pose_prior, window=frames)
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
         problem.columns = torch.arange(BODY.stop)
