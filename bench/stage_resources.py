@@ -32,14 +32,16 @@ from intercap_core.stage_list import STAGES
 
 FROM_ARTEFACTS = tuple(name for name, stage in STAGES.items() if len(stage.reads) > 1)
 MEGABYTE = 1 << 10  # in kilobytes
-# Ragged datasets: offsets with one entry per image (of all cameras, or within a camera's group),
-# and the datasets that they index.
+# Ragged datasets: offsets with one entry per frame or image (of all cameras, or within a camera's
+# group), and the datasets that they index.
 _PER_IMAGE = {
     "mask_offsets": ("mask_rle",),
     "beside_offsets": ("beside_rle",),
     "candidate_offsets": (
         "candidate_scores", "candidate_extents", "candidate_things", "candidate_rle",
     ),
+    "cloud_offsets": ("cloud_points", "cloud_normals", "cloud_edge", "cloud_view"),
+    "rim_offsets": ("rim_rays", "rim_normals", "rim_view"),
 }  # fmt: skip
 _PER_SET = {
     "people_offsets": ("people",),
@@ -118,7 +120,7 @@ def _nearest_sets(image_of: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def _put_ragged(read: Artefact, writer: Writer, key: str, order: np.ndarray, frames: int) -> None:
-    """Write offsets with one entry per image (T, C), and the datasets that they index."""
+    """Write offsets with one entry per frame or image (T, C), and the datasets that they index."""
     offsets = read[key]
     views = (len(offsets) - 1) // frames
     image = (order[:, None] * views + np.arange(views)).ravel()

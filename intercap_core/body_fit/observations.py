@@ -80,6 +80,11 @@ class Observations:
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
         return placed | ((gap <= 1.0) & (known >= 6))
 
+    @property
+    def cameras_of_person(self) -> np.ndarray:
+        """(C,) bool: the camera shows a keypoint of the body in a usable frame."""
+        return (self.confidence[self.usable][:, :, BODY] > 0).any((0, 2))
+
     def window(self, frames: slice) -> Observations:
         """Return the observations of some frames."""
         cameras = len(self.rig)

@@ -112,7 +112,7 @@ class Measurement:
             floor: point (3,) and unit normal (3,) of the floor; NaN = unknown.
             truth: true body and object; None = unknown.
         """
-        rows: list[Values] = []
+        values: Values = {}
         handled = self.handled
         counts = np.zeros(len(handled.points) if handled else 0, np.int32)
         true_points = seen = true_surface = None
@@ -144,9 +144,13 @@ class Measurement:
                 row |= self._true_object(
                     t, truth, true_surface, true_points, clouds[1], seen_object
                 )
-            rows.append(row)
+            for key, value in row.items():
+                if key not in values:
+                    # single precision, since distances by vertex fill the memory
+                    kind = np.float32 if np.ndim(value) else np.asarray(value).dtype
+                    values[key] = np.empty((len(self.body.joints), *np.shape(value)), kind)
+                values[key][t] = value
             progress.step()
-        values = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
         if handled is None:
             return values
         touching = contact.vertex_contact(values["body_contact_distance"], self.threshold)

@@ -51,6 +51,7 @@ class JointInputs:
     against_floor: str  # Why the recording's sequential fits contradict the floor; "" if they don't
     time_offset: np.ndarray  # (C,) the scene's time offsets, seconds
     time_offset_sigma: np.ndarray  # (C,) standard deviations, seconds; NaN if not estimated
+    cameras_of_person: np.ndarray  # (C,) cameras that show the body in any usable frame
     cameras: CameraFit  # The scene's cameras and their covariance
     encoder: MotionEncoder | None  # LEMO's motion encoder, if the settings name its weights
     fps: float  # Frames per second
@@ -155,6 +156,7 @@ def open_inputs(
             against_floor=against_floor,
             time_offset=time_offset,
             time_offset_sigma=time_offset_sigma,
+            cameras_of_person=observations.cameras_of_person,
             cameras=cameras,
             encoder=encoder,
             fps=fps,

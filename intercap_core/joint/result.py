@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
@@ -66,6 +66,17 @@ class JointResult:
     contradicted: np.ndarray  # (T,) frames whose images contradict the object's pose
     penetrating: np.ndarray  # (T,) frames in which body and object are deep inside each other
     camera_covariance: np.ndarray  # (C, 7, C, 7) of the cameras, see :mod:`.cameras`
+
+    def window(self, frames: slice) -> JointResult:
+        """The result of some frames."""
+        return replace(
+            self,
+            state=self.state.window(frames),
+            probability=self.probability[frames],
+            annotated=self.annotated[frames],
+            contradicted=self.contradicted[frames],
+            penetrating=self.penetrating[frames],
+        )
 
     @classmethod
     def read(cls, path: Path, scene: Artefact) -> JointResult:

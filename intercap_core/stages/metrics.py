@@ -107,17 +107,15 @@ def run(
             "has_truth": known is not None,
             **made_by,
         }
-    verdict = {}
-    # The error model of the verdict was fitted to results of this program, so imported results have
-    # none. Rig and body are still referenced here, so that their cached ray tables are used again.
-    if settings.hold_out and not made_by:
-        verdict = reach_verdict(paths, models, fit_settings)
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
-            writer.put(key, values[key])
+            writer.put(key, values.pop(key))
         flags.write(writer)
-        for key in sorted(verdict):
-            writer.put(f"verdict/{key}", verdict[key])
+        # The error model of the verdict was fitted to results of this program, so imported results
+        # have none. Rig and body are still referenced here: their cached ray tables are used again.
+        if settings.hold_out and not made_by:
+            for key, value in sorted(reach_verdict(paths, models, fit_settings).items()):
+                writer.put(f"verdict/{key}", value)
 
 
 def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) -> Values:

@@ -13,13 +13,18 @@ to convergence with new correspondences would move the body 4 to 10 % further.
 The cameras are fixed in these refits. Corrections d of the cameras (:mod:`intercap_core.joint.
 cameras`) with the covariance S that the joint fit states move the fit by -H^-1 H_xd d, so that its
 covariance grows by J S J^T with J = H^-1 H_xd. This part of the error is the same in all frames.
+
+Long recordings are evaluated in windows of ``WINDOW`` frames with ``MARGIN`` further frames on
+either side, since only neighbouring frames are coupled: memory does not grow with the recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +59,10 @@ class JudgedPart(StrEnum):
     OBJECT = "object"
 
 
+WINDOW = 300
+"""Frames of a window whose results are kept; limited by memory, 3 MB a frame."""
+MARGIN = 30
+"""Frames before and after: errors of the body at the end of a window have decayed to 1 % there."""
 SURFACE = 1
 """Index of surface points (depth, rims of the person's masks) in the last axis of masks (T, C, 2)
 of the images that are used. Index 0 is that of keypoints and of the object's silhouettes."""
@@ -207,47 +216,89 @@ class HeldOut:
     """(T,) by part, displacement if the images of this and every other frame are not used,
     metres."""
 
+    @classmethod
+    def joined(cls, windows: Sequence[tuple[HeldOut, slice]]) -> HeldOut:
+        """Join the evaluations of windows; the slices select the frames of each that are kept."""
+        held, kept = zip(*windows, strict=True)
 
-def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
+        def cut(values: list[np.ndarray], axis: int = -1) -> np.ndarray:
+            """Join the kept frames of values; ``axis`` counts the frames."""
+            parts = [
+                value.take(np.arange(one.start, one.stop), axis)
+                for value, one in zip(values, kept, strict=True)
+            ]
+            return np.concatenate(parts, axis)
+
+        def join(name: str) -> Any:
+            values = [getattr(one, name) for one in held]
+            if isinstance(values[0], ViewErrors):
+                errors = [vars(value) for value in values]
+                return ViewErrors(**{key: cut([e[key] for e in errors], 0) for key in errors[0]})
+            if isinstance(values[0], dict):
+                return {part: cut([value[part] for value in values]) for part in values[0]}
+            return cut(values)
+
+        names = [field.name for field in fields(cls)[1:]]
+        return cls(held[0].cameras, *(join(name) for name in names))
+
+
+def hold_out(
+    inputs: JointInputs, settings: JointSettings, result: JointResult, window: int = WINDOW
+) -> HeldOut | None:
     """Refit ``result`` without each camera and without every other frame, and compare.
 
-    None if fewer than two cameras show the person.
+    None if fewer than two cameras show the person. Frames are evaluated in windows of about equal
+    length, of at most ``window`` frames each.
     """
+    cameras = np.flatnonzero(inputs.cameras_of_person)
+    if len(cameras) < 2:
+        return None
+    count = len(result.state)
+    bounds = np.linspace(0, count, -(-count // window) + 1).round().astype(int)
+    windows = []
+    for first, last in itertools.pairwise(bounds.tolist()):
+        around = slice(max(0, first - MARGIN), min(count, last + MARGIN))
+        held = _hold_out(inputs.window(around), settings, result.window(around), cameras)
+        windows.append((held, slice(first - around.start, last - around.start)))
+    return HeldOut.joined(windows)
+
+
+def _hold_out(
+    inputs: JointInputs, settings: JointSettings, result: JointResult, cameras: np.ndarray
+) -> HeldOut:
+    """Evaluate one window of frames; ``cameras`` (V,) are those to hold out."""
     assembly = assemble(inputs, settings)
     state = result.state
     _fix_to_result(assembly, result)
     assembly.problem.refresh(state)
     within = _errors_within(assembly)
-    seen = np.isfinite(within.keypoint_px).any(axis=0)
-    cameras = np.flatnonzero(seen)
-    if len(cameras) < 2:
-        return None
+    frames = inputs.frames.start + np.arange(len(state))
     pulls = _camera_pulls(assembly, state, result.camera_covariance)
     refits, points = Refits(assembly, state, pulls), JudgedPoints(inputs)
     everything = np.ones((*within.keypoint_px.shape, 2), bool)
 
-    def without(frames: slice, cameras: slice | int, kind: slice | int) -> State:
+    def without(frames: slice | np.ndarray, cameras: slice | int, kind: slice | int) -> State:
         used = everything.copy()
         used[frames, cameras, kind] = False
         return refits.with_images(used)
 
     whole = slice(None)
     by_camera = [without(whole, int(camera), whole) for camera in cameras]
-    half = [without(slice(first, None, 2), whole, whole) for first in (0, 1)]
+    half = [without(frames % 2 == parity, whole, whole) for parity in (0, 1)]
     no_surface = without(whole, whole, SURFACE)
     common = points.along(state, refits.displaced)
     if isinstance(assembly.object_, ObjectData):
         common[JudgedPart.OBJECT] = np.full(len(state), np.nan)
     # For errors in images, the cameras are held out in turn for 0.2 s each: longer than the window
     # of velocities, and short enough that each has a turn in a recording of two seconds.
-    block = np.arange(len(state)) // max(1, round(inputs.fps * 0.2))
+    block = frames // max(1, round(inputs.fps * 0.2))
     turn = block % len(cameras)
     mixed = _select_states(by_camera, turn)  # each frame from the fit without its held-out camera
     camera_index = cameras[turn]
     judged = _errors_in_held_out(assembly, mixed, camera_index)
     at = points.at(state)
     moved = [points.apart(at, points.at(other)) for other in by_camera]
-    halves = _select_states(half, np.arange(len(state)) % 2)
+    halves = _select_states(half, frames % 2)
     return HeldOut(
         cameras,
         camera_index,

@@ -99,6 +99,25 @@ def test_wrong_camera_has_a_large_held_out_error(
     assert np.median(seen[0]) > np.median(seen[1])  # a fit without it does not follow the lie
 
 
+def test_windows_give_the_values_of_the_whole_recording(
+    capture: fitted.Capture, held: HeldOut, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("intercap_core.evaluation.verdict.hold_out.MARGIN", 2)
+    with _opened(capture) as (inputs, settings, result):
+        joined = hold_out(inputs, settings, result, window=3)
+    assert joined is not None
+    np.testing.assert_array_equal(joined.camera_index, held.camera_index)
+    for name, errors in vars(held.all_cameras).items():
+        np.testing.assert_allclose(getattr(joined.all_cameras, name), errors, rtol=1e-4)
+    for name, errors in vars(held.held_out).items():
+        np.testing.assert_allclose(getattr(joined.held_out, name), errors, rtol=0.05)
+    for part in (JudgedPart.BODY, JudgedPart.HANDS):
+        # ``repeated`` follows from the noise of the poses, which five frames do not tell
+        for name in ("shift", "surface", "common"):
+            found, expected = (getattr(one, name)[part] for one in (joined, held))
+            np.testing.assert_allclose(found, expected, rtol=0.1, atol=1e-4, err_msg=name)
+
+
 def test_a_window_of_the_inputs_has_the_data_of_its_frames(capture: fitted.Capture) -> None:
     def compared(inputs: JointInputs, state: State) -> list[np.ndarray]:
         assembly = assemble(inputs, fitted.FIT_SETTINGS.joint)
