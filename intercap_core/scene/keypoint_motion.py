@@ -200,6 +200,19 @@ class KeypointMotion:
         """Pixel velocities (T, C, K, 2), px/s; 0 = unknown."""
         return np.nan_to_num(np.einsum("tckij,tkj->tcki", self.by_point, self.paths.velocity))
 
+    def window(self, part: slice) -> KeypointMotion:
+        """The motion in some sets, with the bias and scatter of all sets."""
+        paths = self.paths
+        paths = SmoothPaths(paths.times[part], paths.points[part], paths.velocity[part])
+        return replace(
+            self,
+            times=self.times[part],
+            paths=paths,
+            residual=self.residual[part],
+            seen=self.seen[part],
+            valid=self.valid[part],
+        )
+
     def at_offsets(self, offset: np.ndarray) -> KeypointMotion:
         """The same motion, with the effect of known time offsets removed from the residuals.
 
@@ -231,6 +244,8 @@ class KeypointMotion:
     def projector(self) -> np.ndarray:
         """(T, K, 2C, 2C) projector that removes the point's position from weighted residuals.
 
+        It takes 60 kB per set of six cameras: use it in windows.
+
         Rows and columns are x and y of each view. With A = W^(1/2) J it is
         (I - A (A'A)^-1 A') W^(1/2), with the inverse variances W and J = :attr:`by_point`.
         """
@@ -245,9 +260,10 @@ class KeypointMotion:
         onto = np.einsum("tkei,tkij,tkfj->tkef", rows, np.linalg.inv(normal), rows, optimize=True)
         return (np.eye(2 * views) - onto) * root[:, :, None, :]
 
-    def projected(self, values: np.ndarray) -> np.ndarray:
-        """Apply :attr:`projector` to pixel differences (T, C, K, 2) of all views: (T, K, 2C)."""
-        flat = np.moveaxis(np.nan_to_num(values), 1, 2).reshape(*self.projector.shape[:3])
+    @cached_property
+    def projected_residual(self) -> np.ndarray:
+        """(T, K, 2C) :attr:`projector` times the residuals of all views."""
+        flat = np.moveaxis(np.nan_to_num(self.residual), 1, 2).reshape(*self.projector.shape[:3])
         return np.einsum("tkef,tkf->tke", self.projector, flat)
 
     def projected_of(self, camera: int, values: np.ndarray) -> np.ndarray:
@@ -337,10 +353,17 @@ def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.nd
 
 def _project(points: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (T, C, K, 2) and their derivatives (T, C, K, 2, 3) by points (T, K, 3)."""
-    pixels, by_camera = projection.project_with_jacobian(
-        _in_cameras(points, rig), rig.colour_parameters[:, None]
-    )
-    return _where_known(points, pixels), by_camera @ rig.colour_from_master[:, None, :3, :3]
+    sets, count = points.shape[:2]
+    pixels = np.empty((sets, len(rig), count, 2))
+    by_point = np.empty((sets, len(rig), count, 2, 3))
+    together = 1000  # sets, limited by memory: intermediate results of a set take 100 kB
+    for start in range(0, sets, together):
+        at = slice(start, start + together)
+        pixels[at], by_camera = projection.project_with_jacobian(
+            _in_cameras(points[at], rig), rig.colour_parameters[:, None]
+        )
+        by_point[at] = by_camera @ rig.colour_from_master[:, None, :3, :3]
+    return _where_known(points, pixels), by_point
 
 
 def _pixels_of(points: np.ndarray, rig: Rig) -> np.ndarray:

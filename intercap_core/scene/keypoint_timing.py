@@ -178,10 +178,7 @@ def estimate_offsets(motion: KeypointMotion, master: int, expected: np.ndarray) 
         expected: (C,) mean of the prior, seconds; its deviation is :func:`.in_step_sigma`.
     """
     views = len(motion.rig)
-    # derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors
-    by_offset = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
-    columns = np.concatenate([np.stack(by_offset), _pose_columns(motion)])
-    matrices, vectors = _keypoint_equations(motion, columns)
+    matrices, vectors = _keypoint_equations(motion)
     prior_sigma = np.full(views, in_step_sigma(frame_interval(motion.times)))
     # given poses are uncertain by a degree and 2 cm; tuned on the studio
     pose_sigma = np.repeat([np.radians(1.0), 0.02], 3)
@@ -269,42 +266,43 @@ def as_series(values: np.ndarray) -> np.ndarray:
 
 def estimate_noise(motion: KeypointMotion) -> TimeNoise:
     """Noise model of the motion's projected residuals in the first window."""
-    part = windows(len(motion.times))[0]
-    series = as_series(motion.projected(motion.residual))[..., part]
-    valid = np.repeat(np.moveaxis(motion.valid, (0, 1, 2), (2, 1, 0)), 2, axis=1)[..., part]
+    first = motion.window(windows(len(motion.times))[0])
+    series = as_series(first.projected_residual)
+    valid = np.repeat(np.moveaxis(first.valid, (0, 1, 2), (2, 1, 0)), 2, axis=1)
     size = series.shape[2]
-    return fit_noise(motion.times[part], series.reshape(-1, size), valid.reshape(-1, size))
+    return fit_noise(first.times, series.reshape(-1, size), valid.reshape(-1, size))
 
 
-def precisions(motion: KeypointMotion, noise: TimeNoise, part: slice) -> np.ndarray:
-    """Inverse covariances (K, C, W, W) over time of one window, the same for x and y."""
-    valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
+def precisions(motion: KeypointMotion, noise: TimeNoise) -> np.ndarray:
+    """Inverse covariances (K, C, W, W) over time of one window's motion, the same for x and y."""
+    valid = np.moveaxis(motion.valid, 0, 2)  # (C, K, W)
     variance = np.where(valid, 0.0, 1e6)  # practically no weight if missing
     views, count, size = variance.shape
-    inverse = noise.precision(motion.times[part], variance.reshape(-1, size))
+    inverse = noise.precision(motion.times, variance.reshape(-1, size))
     return np.swapaxes(inverse.reshape(views, count, size, size), 0, 1)
 
 
-def _keypoint_equations(
-    motion: KeypointMotion, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix (K, n, n) and vector (K, n) of each keypoint, for n unknowns.
+def _keypoint_equations(motion: KeypointMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix (K, n, n) and vector (K, n) of each keypoint, for n = 7C unknowns.
 
-    ``columns``: (n, T, K, 2C) derivatives of the projected residuals by the unknowns.
+    These are the offsets, then the pose errors of each camera.
     """
     noise = estimate_noise(motion)
-    series = as_series(motion.projected(motion.residual))
-    size, _, count, _ = columns.shape
-    matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
+    views, count = motion.valid.shape[1:]
+    matrices, vectors = np.zeros((count, 7 * views, 7 * views)), np.zeros((count, 7 * views))
     for part in windows(len(motion.times)):
-        precision = precisions(motion, noise, part)
+        own = motion.window(part)
+        # derivatives (n, W, K, 2C) of the projected residuals
+        by_offset = [own.projected_of(c, own.speed_px[:, c]) for c in range(views)]
+        columns = np.concatenate([np.stack(by_offset), _pose_columns(own)])
+        series, precision = as_series(own.projected_residual), precisions(own, noise)
         for k in range(count):
-            for c in np.flatnonzero(motion.valid[part, :, k].any(0)):
+            for c in np.flatnonzero(own.valid[:, :, k].any(0)):
                 both = slice(2 * c, 2 * c + 2)
-                rows = columns[:, part, k, both].transpose(2, 1, 0)  # (2, W, n)
+                rows = columns[:, :, k, both].transpose(2, 1, 0)  # (2, W, n)
                 weighted = precision[k, c] @ rows
                 matrices[k] += (np.swapaxes(rows, 1, 2) @ weighted).sum(0)
-                vectors[k] += np.einsum("xtn,xt->n", weighted, series[k, both, part])
+                vectors[k] += np.einsum("xtn,xt->n", weighted, series[k, both])
     return matrices, vectors
 
 

@@ -15,6 +15,7 @@ master itself may be late. Without motion no slip is detectable, and none is rep
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -106,7 +107,7 @@ def find_slips(
     for _ in range(12):
         seen = motion if offset is None else motion.at_offsets(offset)
         evidence = _Evidence(seen, steps, fps)
-        best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
+        best = evidence.best(range(len(rig)))
         if best:
             for interval in _apart(best, longest):
                 _apply(slip, interval)
@@ -196,11 +197,12 @@ def _polished(
             before = slip.copy()
             before[run, c] = constant
             shown = with_keypoints(motion, keypoints_by_moment(keypoints, before))
-            interval = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
+            found = _Evidence(shown.at_offsets(offset), steps, fps).best([c])
             result[run, c] = constant
-            if interval is not None and not _spans_all(interval, len(slip)):
-                _apply(result, interval)
-                intervals.append(interval)
+            for interval in found:
+                if not _spans_all(interval, len(slip)):
+                    _apply(result, interval)
+                    intervals.append(interval)
     return result, intervals
 
 
@@ -232,50 +234,55 @@ class _Evidence:
 
     def __init__(self, motion: KeypointMotion, steps: list[int], fps: float) -> None:
         self._steps = steps
-        self._late = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in steps])
+        self._late = np.empty((len(steps), *motion.residual.shape))
+        for number, step in enumerate(steps):
+            self._late[number] = np.nan_to_num(motion.shifted(step / fps))
         self._motion = _tolerant(motion, self._late)
         # (C,) sets between two images; a camera of half the rate can only slip by even numbers
         self._own_steps = np.rint(usual_steps(np.any(motion.seen, -1))).astype(int)
-        noise = estimate_noise(self._motion)
+        self._noise = estimate_noise(self._motion)
         whole = windows(len(motion.times))
         between = [
             slice((a.start + a.stop) // 2, (b.start + b.stop) // 2) for a, b in pairwise(whole)
         ]
         self._parts = [(part, False) for part in whole] + [(part, True) for part in between]
-        self._precisions = [precisions(self._motion, noise, part) for part, _ in self._parts]
 
-    def best(self, camera: int) -> SlipInterval | None:
-        """The significant interval of one camera with the greatest gain; None = there is none.
+    def best(self, cameras: Sequence[int]) -> list[SlipInterval]:
+        """The significant interval of greatest gain of each camera that has one.
 
         An interval of all sets stands for a constant delay, which is preferred to a temporary slip
         whose gain is greater by less than 10; tuned on the studio.
         """
-        sets, own_step = len(self._motion.times), self._own_steps[camera]
-        root, series = _own_series(self._motion, camera)
-        always = {step: np.zeros(series.shape[1]) for step in self._steps}
-        top = None
-        for (part, between), precision in zip(self._parts, self._precisions, strict=True):
-            own = root[part], series[part], precision[:, camera]
-            cases = {
-                step: _Slipped.of(*own, late[part, camera])
-                for step, late in zip(self._steps, self._late, strict=True)
-            }
-            if not between:
-                for step, case in cases.items():
-                    always[step] += case.gains(0, part.stop - part.start)
-            interval = _best_of_window(
-                {s: case for s, case in cases.items() if s > 0 and s % own_step == 0}
-            )
-            if interval is not None and (top is None or interval.gain > top.gain):
-                first, last = part.start + interval.first, part.start + interval.last
-                top = replace(interval, camera=camera, first=first, last=last)
-        step = max(self._steps, key=lambda s: _robust_gain(always[s]))
-        whole = SlipInterval(
-            camera, 0, sets - 1, step, float(always[step].sum()), _robust_gain(always[step])
-        )
-        if whole.significant and (top is None or whole.gain > top.gain - 10.0):
-            return whole
-        return top
+        sets, count = self._motion.valid.shape[0], self._motion.valid.shape[2]
+        always = {camera: np.zeros((len(self._steps), count)) for camera in cameras}
+        top: dict[int, SlipInterval] = {}
+        for part, between in self._parts:
+            motion = self._motion.window(part)
+            precision = precisions(motion, self._noise)
+            for camera in cameras:
+                own = *_own_series(motion, camera), precision[:, camera]
+                cases = {
+                    step: _Slipped.of(*own, late[part, camera])
+                    for step, late in zip(self._steps, self._late, strict=True)
+                }
+                if not between:
+                    gains = [case.gains(0, part.stop - part.start) for case in cases.values()]
+                    always[camera] += np.stack(gains)
+                own_step = self._own_steps[camera]
+                interval = _best_of_window(
+                    {s: case for s, case in cases.items() if s > 0 and s % own_step == 0}
+                )
+                if interval is not None and (camera not in top or interval.gain > top[camera].gain):
+                    first, last = part.start + interval.first, part.start + interval.last
+                    top[camera] = replace(interval, camera=camera, first=first, last=last)
+        for camera in cameras:
+            robust = [_robust_gain(gains) for gains in always[camera]]
+            chosen = int(np.argmax(robust))
+            gain = float(always[camera][chosen].sum())
+            whole = SlipInterval(camera, 0, sets - 1, self._steps[chosen], gain, robust[chosen])
+            if whole.significant and (camera not in top or whole.gain > top[camera].gain - 10.0):
+                top[camera] = whole
+        return [top[camera] for camera in cameras if camera in top]
 
 
 def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
@@ -309,7 +316,7 @@ def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.nda
     trace = np.trace(block, axis1=2, axis2=3)[..., None, None]
     # square root of a symmetric 2 x 2 matrix in closed form; ``determinant`` is already a root
     half = (block + determinant * np.eye(2)) / np.sqrt(trace + 2 * determinant)
-    weighted = motion.projected(motion.residual)[..., both]
+    weighted = motion.projected_residual[..., both]
     return half * scale, np.linalg.solve(half, weighted[..., None])[..., 0]
 
 
