@@ -71,13 +71,13 @@ class ColourDecision:
         # an unlikely pose may have too few certain frames to learn from
         if any(learnt[k] is None and own[k] > 0.05 for k in gauges):
             return decoded
+        known = {k: colours for k, colours in learnt.items() if colours is not None}
+        every = self._add_colours(emissions, list(known.values()), rivals)
         results = []
-        for k, colours in learnt.items():
-            if colours is not None:
-                values = self._add_colours(emissions, colours, rivals)
-                again = decode_given(values, steps, first, k, self._absent)
-                evidence = again.evidence + self._paint_log_ratio(colours)
-                results.append(replace(again, evidence=evidence))
+        for (k, colours), values in zip(known.items(), every, strict=True):
+            again = decode_given(values, steps, first, k, self._absent)
+            evidence = again.evidence + self._paint_log_ratio(colours)
+            results.append(replace(again, evidence=evidence))
         return mix_decisions(results) if results else decoded
 
     def _ambiguous(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
@@ -121,16 +121,27 @@ class ColourDecision:
         return 3 * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
 
     def _add_colours(
-        self, emissions: Sequence[np.ndarray], learnt: Appearance, rivals: Mapping[int, np.ndarray]
-    ) -> list[np.ndarray]:
-        """Return the emissions with the evidence of the learnt colours in ambiguous frames."""
+        self,
+        emissions: Sequence[np.ndarray],
+        learnt: Sequence[Appearance],
+        rivals: Mapping[int, np.ndarray],
+    ) -> list[list[np.ndarray]]:
+        """Return the emissions with the evidence of each of the ``learnt`` colours.
+
+        Only those of ambiguous frames change.
+        """
         apart = self._observer.frames_in(ERROR_LASTING_S)
-        values = [own.copy() for own in emissions]
-        if learnt.is_coloured:
-            for t, some in rivals.items():
-                seen = {int(k): self._colours(t, int(k)) for k in some}
+        result = [[own.copy() for own in emissions] for _ in learnt]
+        if not any(one.is_coloured for one in learnt):
+            return result
+        for t, some in rivals.items():
+            # measured for all of ``learnt`` at once and not kept: 100 kB a hypothesis
+            seen = {int(k): self._measure(t, self._hypotheses.fits[t][k]) for k in some}
+            for one, values in zip(learnt, result, strict=True):
+                if not one.is_coloured:
+                    continue
                 ratios = {
-                    k: self._observer.share * learnt.log_ratio(colours, apart)
+                    k: self._observer.share * one.log_ratio(colours, apart)
                     for k, colours in seen.items()
                     if colours is not None
                 }
@@ -138,7 +149,7 @@ class ColourDecision:
                 values[t] += min([0.0, *ratios.values()])
                 for k, ratio in ratios.items():
                     values[t][k] = emissions[t][k] + ratio
-        return values
+        return result
 
     def _colours(self, t: int, k: int) -> SurfaceColours | None:
         """Return the colours of frame t at its hypothesis k, cached; None if nothing is visible."""

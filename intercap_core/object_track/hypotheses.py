@@ -207,8 +207,15 @@ class Hypotheses:
             unwrap_symmetry(self._observer.mesh.symmetry, poses, known), known, self._times
         )
         changed = set()
+        late = max(
+            (
+                abs(view.geometry.time_offset_s)
+                for t in frames[:1]
+                for view in self._observer.views(t)
+            ),
+            default=0.0,
+        )
         for t in frames:
-            late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(t))
             for k, fit in enumerate(self.fits[t]):
                 twist = shift_twist(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
                 turn, shift = np.abs(twist - fit.twist).reshape(2, 3).max(1) * late

@@ -11,6 +11,7 @@ import logging
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
+from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.object_track.decoder import HIDDEN, Decoded
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
@@ -128,7 +129,7 @@ class Proposals:
         sure = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubtful)}
         uncertain = np.flatnonzero(doubtful).tolist()
         new = False
-        for t in sorted(uncertain, key=lambda t: min((abs(t - u) for u in sure), default=0)):
+        for t in _nearest_first(uncertain, list(sure)):
             if self._hypotheses.best(t) < poor and t not in self._searched_nearby:
                 new |= self._search_nearby(t, sure)
         near = self._prior.near_annotated(hidden)
@@ -145,11 +146,11 @@ class Proposals:
         is_open = (probability < DOUBTFUL_PROBABILITY) | (weight < 0.25 * usual)
         uncertain = [t for t in uncertain if is_open[t]]
         while len(self._searched) < budget and not new:
+            distance = _distance(uncertain, sorted(self._searched), default=apart)
             uncertain = [
                 t
-                for t in uncertain
-                if self._hypotheses.best(t) < poor
-                and min((abs(t - u) for u in self._searched), default=apart) >= apart
+                for t, away in zip(uncertain, distance, strict=True)
+                if away >= apart and self._hypotheses.best(t) < poor
             ]
             if not uncertain:
                 break
@@ -298,3 +299,16 @@ class Proposals:
                 self._hypotheses.follow(t, fit)
                 new = True
         return new
+
+
+def _distance(frames: list[int], known: list[int], default: int = 0) -> list[int]:
+    """Return the distances (k,) of frames from the nearest of ``known``, ascending."""
+    if not known or not frames:
+        return [default] * len(frames)
+    return np.abs(nearest(known, frames) - frames).tolist()
+
+
+def _nearest_first(frames: list[int], known: list[int]) -> list[int]:
+    """Sort frames by their distance from the nearest of ``known``, ascending."""
+    distance = dict(zip(frames, _distance(frames, known), strict=True))
+    return sorted(frames, key=distance.__getitem__)

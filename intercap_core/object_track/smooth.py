@@ -102,8 +102,12 @@ def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
     for number, members in enumerate(
         np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)
     ):
-        apart = np.linalg.norm(place[members, None] - place[members], axis=-1)
-        cost = np.minimum(apart, reach_m) @ weight[members]
+        parts = [
+            np.minimum(np.linalg.norm(place[some, None] - place[members], axis=-1), reach_m)
+            @ weight[members]
+            for some in np.split(members, range(1000, len(members), 1000))  # memory: (1000, n, 3)
+        ]
+        cost = np.concatenate(parts)
         slack = 0.1 * reach_m * weight[members].sum()
         near = np.flatnonzero(cost <= cost.min() + slack)
         typical[number] = members[near[weight[members][near].argmax()]]

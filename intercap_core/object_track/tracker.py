@@ -18,6 +18,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.decoder import (
     FREE_COST_S,
@@ -271,7 +272,7 @@ class Tracker:
         It is the likeliest hypothesis of the nearest frame that has any.
         """
         fits = self._hypotheses.fits
-        u = min((u for u, own in enumerate(fits) if own), key=lambda u: abs(u - t))
+        (u,) = nearest([u for u, own in enumerate(fits) if own], [t]).tolist()
         weights = self._prior.weigh(u, fits[u])
         assessed = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
         return FittedPose(assessed.pose, np.eye(6), assessed.views)

@@ -14,6 +14,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer, default_renderer
 from intercap_core.object_track.reduced_mask import (
     EMPTY,
+    PackedMask,
     ReducedMask,
     decode,
     reduced_lens,
@@ -76,10 +77,19 @@ class ViewGeometry:
 
     def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
         """Reduce depth (H, W) uint16 mm to float32 metres without bias, 0 where invalid."""
-        raw = depth_mm[:: self.depth_step, :: self.depth_step]
-        depth = raw * np.float32(1e-3) - np.float32(self.depth_bias_m)
-        depth[raw == 0] = 0
+        return self.metres(depth_mm[:: self.depth_step, :: self.depth_step])
+
+    def metres(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Convert depth (h, w) uint16 mm to float32 metres without bias, 0 where invalid."""
+        depth = depth_mm * np.float32(1e-3) - np.float32(self.depth_bias_m)
+        depth[depth_mm == 0] = 0
         return depth
+
+    def millimetres(self, depth: np.ndarray) -> np.ndarray:
+        """Invert :meth:`metres`."""
+        recorded = np.rint((depth + np.float32(self.depth_bias_m)) * np.float32(1e3))
+        recorded[depth == 0] = 0
+        return recorded.astype(np.uint16)
 
     @cached_property
     def depth_from_colour(self) -> np.ndarray:
@@ -150,13 +160,6 @@ class View:
             background=nearer(self.background),
         )
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of depth and masks, bytes; frames share the background."""
-        masks = [self.person, *(candidate.mask for candidate in self.candidates)]
-        depth = 0 if self.depth is None else self.depth.nbytes
-        return depth + sum(mask.mask.nbytes for mask in masks)
-
     @classmethod
     def build(
         cls,
@@ -194,6 +197,51 @@ class View:
         )
         room = np.zeros((0, 0), np.float32) if background is None else background
         return cls(geometry, depth, person, whole + parts, detected, room)
+
+
+@dataclass(frozen=True, eq=False)
+class PackedView:
+    """A view in less than half of its memory: depth in millimetres, masks as bits."""
+
+    view: View
+    """The view without depth and masks."""
+    depth: np.ndarray | None
+    """(h, w) uint16 mm as recorded; None without depth."""
+    person: PackedMask
+    """Mask of the person."""
+    candidates: tuple[PackedMask, ...]
+    """Mask of each candidate."""
+
+    @classmethod
+    def of(cls, view: View) -> PackedView:
+        """Pack a view."""
+        return cls(
+            replace(
+                view,
+                depth=None,
+                person=EMPTY,
+                candidates=tuple(replace(one, mask=EMPTY) for one in view.candidates),
+            ),
+            None if view.depth is None else view.geometry.millimetres(view.depth),
+            PackedMask.of(view.person),
+            tuple(PackedMask.of(candidate.mask) for candidate in view.candidates),
+        )
+
+    def unpack(self) -> View:
+        """Return the view."""
+        candidates = zip(self.view.candidates, self.candidates, strict=True)
+        return replace(
+            self.view,
+            depth=None if self.depth is None else self.view.geometry.metres(self.depth),
+            person=self.person.unpack(),
+            candidates=tuple(replace(one, mask=mask.unpack()) for one, mask in candidates),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of depth and masks, bytes; frames share the background."""
+        masks = sum(mask.bits.nbytes for mask in (self.person, *self.candidates))
+        return masks + (0 if self.depth is None else self.depth.nbytes)
 
 
 @dataclass(frozen=True)

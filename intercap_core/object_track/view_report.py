@@ -86,7 +86,7 @@ def _compare(face, x0, y0, person, px, py, mask, mx, my):
     return visible, common
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ViewReport:
     """Agreement of one view with a pose. Residuals are NaN if nothing was compared."""
 

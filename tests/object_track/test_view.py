@@ -17,7 +17,13 @@ from intercap_core.object_track.reduced_mask import (
     reduced_lens,
     remove_person,
 )
-from intercap_core.object_track.view import View, ViewGeometry, camera_distances
+from intercap_core.object_track.view import (
+    MaskCandidate,
+    PackedView,
+    View,
+    ViewGeometry,
+    camera_distances,
+)
 from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH
 
 RNG = np.random.default_rng(0)
@@ -109,12 +115,13 @@ def test_distances_of_cameras_are_medians_over_known_joints():
 
 def test_the_cache_evicts_the_least_recently_used_frames():
     loaded = []
+    person = ReducedMask(2, 3, np.ones((8, 100), bool))  # 100 bytes packed
 
     def load(t: int) -> list[View]:
         loaded.append(t)
-        return [View(None, np.zeros((10, 10), np.float32), EMPTY, ()) for _ in range(2)]
+        return [View(None, None, person, ()) for _ in range(2)]
 
-    views = ViewCache(load, max_bytes=2400)  # three frames of 800 bytes
+    views = ViewCache(load, max_bytes=600, recent=1)  # three frames
     for t in (0, 1, 2, 0, 1, 2):
         assert views(t) is views(t)
     assert loaded == [0, 1, 2]
@@ -125,3 +132,26 @@ def test_the_cache_evicts_the_least_recently_used_frames():
     assert loaded == [0, 1, 2, 3, 1]
     small = ViewCache(load, max_bytes=10)  # it keeps one frame, however large
     assert small(0) is small(0)
+
+
+def test_a_packed_view_is_unpacked_without_loss():
+    rng = np.random.default_rng(0)
+    camera = Camera("k1", COLOUR, DEPTH, COLOUR_FROM_DEPTH, np.eye(4))
+    depth_mm = rng.integers(0, 9000, (DEPTH.height, DEPTH.width))
+    depth_mm[rng.random(depth_mm.shape) > 0.8] = 0  # invalid
+    geometry = ViewGeometry.for_object(camera, 0.3, 2.5, depth_bias_m=0.00731)
+    mask = ReducedMask(5, 7, rng.random((31, 13)) > 0.5)
+    candidates = (MaskCandidate(0, "cup", mask), MaskCandidate(3, "", EMPTY))
+    depth = geometry.reduced_depth(depth_mm.astype(np.uint16))
+    view = View(geometry, depth, mask, candidates, False)
+    again = PackedView.of(view).unpack()
+    np.testing.assert_array_equal(again.depth, depth)
+    assert (again.geometry, again.detected, again.background) == (geometry, False, view.background)
+    for one, other in zip(
+        (view.person, *(c.mask for c in candidates)),
+        (again.person, *(c.mask for c in again.candidates)),
+        strict=True,
+    ):
+        assert (one.x0, one.y0) == (other.x0, other.y0)
+        np.testing.assert_array_equal(one.mask, other.mask)
+    assert [(c.index, c.label) for c in again.candidates] == [(0, "cup"), (3, "")]

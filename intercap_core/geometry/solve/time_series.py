@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import rotation_log
@@ -13,6 +15,17 @@ def sample_evenly(available: np.ndarray, most: int) -> np.ndarray:
     if len(frames) <= most:
         return frames
     return frames[np.linspace(0, len(frames) - 1, most).round().astype(int)]
+
+
+def nearest(known: np.ndarray | Sequence[int], frames: np.ndarray | Sequence[int]) -> np.ndarray:
+    """Return the nearest of ``known`` (n,) frames, ascending and not empty, to ``frames`` (k,).
+
+    Of two that are as near, the first is returned.
+    """
+    known, frames = np.asarray(known), np.asarray(frames)
+    after = np.searchsorted(known, frames)
+    low, high = known[np.maximum(after - 1, 0)], known[np.minimum(after, len(known) - 1)]
+    return np.where(np.abs(frames - low) <= np.abs(high - frames), low, high)
 
 
 def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -11,7 +11,13 @@ from intercap_core.geometry.solve.time_series import (
     cheapest_sequence,
     filled_linearly,
     limited_velocity,
+    nearest,
 )
+
+
+def test_the_nearest_known_frames():
+    assert nearest([2, 6, 7], [0, 2, 3, 4, 5, 6, 9]).tolist() == [2, 2, 2, 2, 6, 6, 7]
+    assert nearest([3], [1, 3, 8]).tolist() == [3, 3, 3]
 
 
 def test_gaps_are_linear_and_ends_constant():
