@@ -192,7 +192,7 @@ class BodyClip:
                 f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
                 "recording with the body model that it was made for"
             )
-        clouds = person_clouds(frames, seen, settings.points_per_frame)
+        clouds = list(person_clouds(frames, seen, settings.points_per_frame))
         return cls(model, seen, clouds, settings, truth.vertices)
 
     def __len__(self) -> int:
@@ -292,7 +292,7 @@ class JointClip:
             floor = FloorPlane(scene["ground_point"], scene["ground_normal"]) if found else None
             fps = float(scene.attributes["fps"])
         seen = read_observations(paths["scene"], paths["person"])
-        clouds = person_clouds(paths["frames"], seen, settings.points_per_frame)
+        clouds = list(person_clouds(paths["frames"], seen, settings.points_per_frame))
         fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model))
         start = sequential.state
         if failed.any() or len(fitter.frames) != len(start):

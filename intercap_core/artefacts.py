@@ -30,6 +30,7 @@ MADE_FROM = "made_from"  # attribute with the manifest of pipeline.provenance
 PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # one chunk fits into HDF5's default chunk cache
+GROWING_CHUNK_BYTES = 1 << 16  # of datasets of unknown length, whose last chunk is partly empty
 _CHECKED_BYTES = 1 << 30  # the ratio is not checked for smaller datasets
 _MAX_RATIO = 1 << 16  # bytes unpacked per byte stored; Blosc2 packs a chunk of zeros into 32 bytes
 
@@ -162,6 +163,9 @@ class Writer:
             chunks = (1, *shape[1:])  # one image per chunk, because frames are read one by one
         elif shape[0] == 0 and len(shape) == 1:
             chunks = (CHUNK_BYTES // dtype.itemsize,)
+        elif grows:
+            row = dtype.itemsize * int(np.prod(shape[1:]))
+            chunks = (max(1, GROWING_CHUNK_BYTES // row), *shape[1:])
         dataset = self._file.create_dataset(
             key,
             shape=shape,

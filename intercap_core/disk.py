@@ -1,4 +1,4 @@
-"""Links between files, and faults of disks that are full, over a quota or not writable.
+"""Links between files, lists on disk, and faults of disks that are full or not writable.
 
 HDF5 crashes the process if it cannot write its buffers. :class:`PartFile` hides failed writes from
 HDF5 and reports them afterwards.
@@ -9,12 +9,17 @@ from __future__ import annotations
 import errno
 import io
 import os
+import pickle
 import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 from intercap_core.signals import raise_pending, unbroken
+
+Item = TypeVar("Item")
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
@@ -154,3 +159,39 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         seen.add(id(error))
         yield error
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+
+
+class DiskList(Sequence[Item]):
+    """A list of items that are pickled to a temporary file, for data that outgrow the memory."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open an empty list, whose file in ``folder`` is removed when the list is released."""
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+        self._places: list[tuple[int, int]] = []
+
+    def append(self, item: Item) -> None:
+        """Append an item; raises OSError if the disk is full."""
+        start = self._file.tell()
+        pickle.dump(item, self._file, pickle.HIGHEST_PROTOCOL)
+        self._file.flush()
+        self._places.append((start, self._file.tell() - start))
+
+    def select(self, indices: Iterable[int]) -> DiskList[Item]:
+        """Return a list of some items, in the same file."""
+        chosen = copy(self)
+        chosen._places = [self._places[index] for index in indices]
+        return chosen
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice) -> DiskList[Item]: ...
+    def __getitem__(self, index: int | slice) -> Item | DiskList[Item]:
+        if isinstance(index, slice):
+            return self.select(range(len(self))[index])
+        start, size = self._places[index]
+        item: Item = pickle.loads(os.pread(self._file.fileno(), size, start))
+        return item

@@ -7,9 +7,10 @@ Depth images around the person are not copied: they are read from frames.h5.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,11 @@ class PersonCloud:
     outlines: tuple[MaskRim, ...] = ()
     """Rims of the person's masks, by camera."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # arrays are pickled faster than tensors
+        arrays = [values.numpy() for values in (self.points, self.normals, self.trust, self.view)]
+        return _cloud_of_arrays, (*arrays, self.windows, self.outlines)
+
     def of_view(self, view: int) -> PersonCloud:
         """Return the part of camera ``view``."""
         mine = self.view == view
@@ -84,13 +90,31 @@ class PersonCloud:
         return replace(self, points=points, normals=normals)
 
 
-def person_clouds(frames: Path, observations: Observations, count: int) -> list[PersonCloud | None]:
-    """Return the cloud of each frame, of about ``count`` points; None = no usable mask."""
+def _cloud_of_arrays(
+    points: np.ndarray,
+    normals: np.ndarray,
+    trust: np.ndarray,
+    view: np.ndarray,
+    windows: tuple[DepthWindow, ...],
+    outlines: tuple[MaskRim, ...],
+) -> PersonCloud:
+    of = torch.from_numpy
+    return PersonCloud(of(points), of(normals), of(trust), of(view), windows, outlines)
+
+
+def person_clouds(
+    frames: Path, observations: Observations, count: int
+) -> Iterator[PersonCloud | None]:
+    """Yield the cloud of each frame, of about ``count`` points; None = no usable mask."""
+    threads = ThreadPool(threads_of_job())
+    together = 64  # frames, limited by memory: a cloud and its depth images have 0.8 MB
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
-        return ThreadPool(threads_of_job()).map(
-            lambda t: _fuse(reader, observations, t, count), range(observations.num_frames)
-        )
+        for start in range(0, observations.num_frames, together):
+            yield from threads.map(
+                lambda t: _fuse(reader, observations, t, count),
+                range(observations.num_frames)[start : start + together],
+            )
 
 
 def _fuse(reader: Frames, observations: Observations, t: int, count: int) -> PersonCloud | None:
@@ -217,28 +241,37 @@ def _measure_normals(
 # --- artefact -------------------------------------------------------------------------------------
 
 
-def put_clouds(writer: Writer, clouds: Sequence[PersonCloud | None], cameras: int) -> None:
-    """Write the clouds of all frames; ``cameras`` is the number of cameras."""
-    none = torch.zeros(0, 3)
-    some = [cloud or PersonCloud(none, none, none[:, 0], none[:, 0].long()) for cloud in clouds]
-    rims = [rim for cloud in some for rim in cloud.outlines]
-    windows = np.zeros((len(some), cameras, 4), np.int32)
-    for t, cloud in enumerate(some):
+def put_clouds(writer: Writer, clouds: Iterable[PersonCloud | None], cameras: int) -> None:
+    """Write the clouds of all frames, one by one; ``cameras`` is the number of cameras."""
+    streams = {
+        key: writer.stream(key, shape)
+        for key, shape in (
+            ("cloud_points", (3,)), ("cloud_normals", (3,)), ("cloud_edge", ()), ("cloud_view", ()),
+            ("rim_rays", (3,)), ("rim_normals", (3,)), ("rim_view", ()),
+        )
+    }  # fmt: skip
+    windows, points, rays = [], [], []
+    for cloud in clouds:
+        windows.append(np.zeros((cameras, 4), np.int32))
+        points.append(0 if cloud is None else len(cloud.points))
+        rays.append(0 if cloud is None else sum(len(rim.rays) for rim in cloud.outlines))
+        if cloud is None:
+            continue
         for window in cloud.windows:
-            windows[t, window.view] = *window.first, *window.depth.shape
-    writer.put("cloud_window", windows)
-    writer.put("cloud_offsets", _offsets([len(cloud.points) for cloud in some]))
-    writer.put("cloud_points", torch.cat([cloud.points for cloud in some]).numpy())
-    writer.put("cloud_normals", torch.cat([cloud.normals for cloud in some]).numpy())
-    writer.put("cloud_edge", torch.cat([cloud.trust < 1 for cloud in some]).numpy())
-    writer.put("cloud_view", torch.cat([cloud.view for cloud in some]).numpy())
-    sizes = [sum(len(rim.rays) for rim in cloud.outlines) for cloud in some]
-    writer.put("rim_offsets", _offsets(sizes))
-    flat = none.numpy()
-    writer.put("rim_rays", np.concatenate([flat, *(rim.rays for rim in rims)]))
-    writer.put("rim_normals", np.concatenate([flat, *(rim.normals for rim in rims)]))
-    views = np.array([rim.view for rim in rims], np.uint8)
-    writer.put("rim_view", np.repeat(views, [len(rim.rays) for rim in rims]))
+            windows[-1][window.view] = *window.first, *window.depth.shape
+        streams["cloud_points"].append(cloud.points.numpy())
+        streams["cloud_normals"].append(cloud.normals.numpy())
+        streams["cloud_edge"].append((cloud.trust < 1).numpy())
+        streams["cloud_view"].append(cloud.view.numpy())
+        rims = cloud.outlines
+        if rims:
+            streams["rim_rays"].append(np.concatenate([rim.rays for rim in rims]))
+            streams["rim_normals"].append(np.concatenate([rim.normals for rim in rims]))
+            views = np.array([rim.view for rim in rims], np.uint8)
+            streams["rim_view"].append(np.repeat(views, [len(rim.rays) for rim in rims]))
+    writer.put("cloud_window", np.stack(windows))
+    writer.put("cloud_offsets", _offsets(points))
+    writer.put("rim_offsets", _offsets(rays))
 
 
 def read_clouds(

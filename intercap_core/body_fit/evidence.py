@@ -7,9 +7,9 @@ deviation of each kind of observation, which is estimated from residuals.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -37,7 +37,9 @@ from intercap_core.body_fit.surface import (
     choose_samples,
 )
 from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
+from intercap_core.disk import DiskList
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.solve.levenberg_marquardt import BLOCK_FRAMES
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
 from intercap_core.geometry.solve.time_series import limited_velocity
@@ -98,14 +100,15 @@ class Evidence:
         cloud_noise: (G,) standard deviation of a sample's mean distance, by covering, metres.
         cloud_residual: (N,) median distance of points at the last matching, metres, NaN = none.
         measured: (N, S) bool, samples with depth points at the last matching.
-        by_view: measurements of each camera at the last matching; None before the first.
+        by_view: measurements of each camera at the last matching; None before the first, and if
+            they were not kept.
     """
 
     def __init__(
         self,
         model: BodyModel,
         observations: Observations,
-        clouds: list[PersonCloud | None],
+        clouds: Sequence[PersonCloud | None],
         cloud_weight: float,
         window: slice | None = None,
     ) -> None:
@@ -121,7 +124,11 @@ class Evidence:
             observations, usable = observations.window(window), usable[window]
         self.observations = observations
         self.frames = np.flatnonzero(usable)
-        self.clouds = [clouds[t] for t in self.frames]
+        self.clouds: Sequence[PersonCloud | None] = (
+            clouds.select(self.frames.tolist())
+            if isinstance(clouds, DiskList)
+            else [clouds[t] for t in self.frames.tolist()]
+        )
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = choose_samples(model)
         self.surface = SkinSurface.around_samples(model, self.samples)
@@ -230,7 +237,7 @@ class Evidence:
             raise ValueError("the problem has no views to compare with")
         return keypoint_term.pixel_residuals(self.points(problem), problem.views)
 
-    def _shift(self, points: Tensor) -> Tensor | None:
+    def _shift(self, points: Tensor, frames: slice = slice(None)) -> Tensor | None:
         """Return the displacement (N, C, K, 3) of points (N, K, 3) until each camera exposes.
 
         It is the velocity of the points times the camera's time offset; None if all offsets are 0.
@@ -238,13 +245,13 @@ class Evidence:
         offset = self.observations.time_offset
         if not np.any(offset):
             return None
-        return self._tensor(offset)[:, None, None] * self.velocity(points)[:, None]
+        return self._tensor(offset)[:, None, None] * self.velocity(points, frames)[:, None]
 
-    def velocity(self, points: Tensor) -> Tensor:
-        """Return the velocity (N, ..., 3), m/s, of points (N, ..., 3) of the usable frames."""
+    def velocity(self, points: Tensor, frames: slice = slice(None)) -> Tensor:
+        """Return the velocity (N, ..., 3), m/s, of points (N, ..., 3) of the usable ``frames``."""
         velocity = limited_velocity(
             points.double().numpy(),
-            self.observations.times[self.frames],
+            self.observations.times[self.frames[frames]],
             max_speed=6.0,  # m/s; hands reach about 5 in everyday tasks; tuned on the studio
         )
         return self._tensor(velocity)
@@ -290,10 +297,12 @@ class Evidence:
         """
         rows = problem.rows
         assert rows is not None
-        params = self.model.parameters(problem.base)
-        points = self.model.forward(params, vertex_ids=self.sample_ids).vertices
-        thickness = problem.thickness_of_group()
-        residual = cloud_term.residuals(points, rows, thickness, self.group).abs()
+        params, thickness = self.model.parameters(problem.base), problem.thickness_of_group()
+        parts = []
+        for at in _blocks(len(self.frames)):
+            points = self.model.forward(params.frames(at), vertex_ids=self.sample_ids).vertices
+            parts.append(cloud_term.residuals(points, rows.frames(at), thickness, self.group).abs())
+        residual = torch.cat(parts)
         for g, covering in enumerate(COVERINGS):
             part = self.group == g
             known = rows.weight[:, part] > 0
@@ -339,7 +348,11 @@ class Evidence:
         return join_frames([(ids[inner], ids[outer], normal) for inner, outer, normal in contacts])
 
     def match(
-        self, problem: BodyProblem, reach: float, only: np.ndarray | None = None
+        self,
+        problem: BodyProblem,
+        reach: float,
+        only: np.ndarray | None = None,
+        keep_views: bool = True,
     ) -> CloudRows:
         """Match the points of all frames to the problem's bodies, and return the rows of E_D.
 
@@ -347,30 +360,48 @@ class Evidence:
             problem: the bodies.
             reach: largest valid distance, metres.
             only: (N,) index of the only camera used in each frame; None = all cameras.
+            keep_views: keep the measurements of each camera in ``by_view``, 110 kB a frame.
         """
-        count, size, views = len(self.frames), len(self.samples.vertex), len(self.observations.rig)
-        params = self.model.parameters(problem.base)
+        rows, kept = [], []
+        for frames in _blocks(len(self.frames)):
+            self.by_view = self._match_frames(problem, frames, reach, only)
+            rows.append(self.rows(self.by_view.points))
+            kept += [self.by_view] if keep_views else []
+        self.by_view = _joined(ViewDistances, kept) if keep_views else None
+        return _joined(CloudRows, rows)
+
+    def _match_frames(
+        self, problem: BodyProblem, frames: slice, reach: float, only: np.ndarray | None
+    ) -> ViewDistances:
+        """Match the points of some frames; see :meth:`match`."""
+        count, size = frames.stop - frames.start, len(self.samples.vertex)
+        views = len(self.observations.rig)
+        base = problem.base[frames]
+        # velocities follow from the positions two frames before and after
+        around = slice(max(frames.start - 2, 0), min(frames.stop + 2, len(self.frames)))
+        own = slice(frames.start - around.start, frames.stop - around.start)
+        params = self.model.parameters(problem.base[around])
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
-        shift = self._shift(where)
+        shift = self._shift(where, around)
+        where, shift = where[own], None if shift is None else shift[own]
         of_views = where.new_zeros(count, views, size)
         points = where.new_zeros(count, views, size)
         expected = problem.thickness().repeat(views)
         normal = where.new_zeros(count, size, 3)
-        for start, vertices, normals in self._bodies(problem.base):
+        for start, vertices, normals in self._bodies(base):
             normal[start : start + len(normals)] = normals[:, self._matcher.sample]
-            measured = [
-                (start + row, *posed)
-                for row, posed in enumerate(zip(vertices, normals, strict=True))
-                if self.clouds[start + row] is not None
-            ]
 
             def match_frame(posed: tuple[int, Tensor, Tensor]) -> None:
-                t, vertices, normals = posed
+                row, vertices, normals = posed
+                t = frames.start + row
                 cloud = self.clouds[t]
-                assert cloud is not None
+                if cloud is None:
+                    return
                 if only is not None:
                     cloud = cloud.of_view(int(only[t]))
-                skin = PosedSkin(vertices, normals, where[t], None if shift is None else shift[t])
+                skin = PosedSkin(
+                    vertices, normals, where[row], None if shift is None else shift[row]
+                )
                 matches = self._matcher.match(
                     cloud,
                     self.observations.rig,
@@ -379,15 +410,15 @@ class Evidence:
                     expected,
                     reach,
                 )
-                of_views[t], points[t] = matches.distance, matches.points
+                of_views[row], points[row] = matches.distance, matches.points
                 self.measured[t], self.cloud_residual[t] = matches.measured, matches.residual
 
-            self._threads.map(match_frame, measured)
-        self.by_view = ViewDistances(of_views, points, where, normal)
-        return self.rows(points)
+            rows = range(start, start + len(normals))
+            self._threads.map(match_frame, list(zip(rows, vertices, normals, strict=True)))
+        return ViewDistances(of_views, points, where, normal)
 
     def rows(self, points: Tensor) -> CloudRows:
-        """Return the rows of E_D of the last :meth:`match`, averaged over cameras.
+        """Return the rows of E_D of ``by_view``, averaged over cameras.
 
         points (N, C, S): effective number of points, which weights each camera's distance. Samples
         with 0 points in all cameras have no weight.
@@ -415,3 +446,17 @@ def _median_confidence(confidence: np.ndarray) -> np.ndarray:
         if len(detected):
             median[part] = np.median(detected)
     return median
+
+
+Rows = TypeVar("Rows", CloudRows, ViewDistances)
+
+
+def _joined(kind: type[Rows], parts: list[Rows]) -> Rows:
+    """Join the frames of all parts."""
+    return parts[0] if len(parts) == 1 else kind(*map(torch.cat, zip(*parts, strict=True)))
+
+
+def _blocks(count: int) -> list[slice]:
+    """Divide frames into blocks, which bounds memory."""
+    starts = range(0, count, BLOCK_FRAMES)
+    return [slice(start, min(start + BLOCK_FRAMES, count)) for start in starts]

@@ -15,6 +15,7 @@ E_P_self is part of stage 5 only. The priors are part of all stages. With the se
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,6 +69,22 @@ class Settled:
 
 
 @dataclass(frozen=True)
+class Hessians:
+    """Gauss-Newton matrices at the solution of a problem, which are computed when they are read."""
+
+    problem: BodyProblem
+    """The problem."""
+    solution: Solution
+    """Its own and shared parameters."""
+
+    def __getitem__(self, frames: slice) -> Tensor:
+        """Return the matrices (b, n + m, n + m) of some frames."""
+        index = torch.arange(len(self.solution.own))[frames]
+        own, shared = self.solution.own[frames], self.solution.shared
+        return self.problem.linearise(own, shared, index).hessian
+
+
+@dataclass(frozen=True)
 class BodyFit:
     """The fit of N of the sequence's T frames."""
 
@@ -77,7 +94,7 @@ class BodyFit:
     """(N, P) parameters."""
     columns: Tensor
     """(n,) columns of a frame's own parameters in ``vectors``."""
-    hessian: Tensor
+    hessian: Tensor | Hessians
     """(N, n + m, n + m) Gauss-Newton matrix of each frame's energy by n own and m shared
     parameters; see :mod:`.problem` for their order."""
     one_shape: bool
@@ -113,7 +130,7 @@ class Fitter:
         self,
         model: BodyModel,
         observations: Observations,
-        clouds: list[PersonCloud | None],
+        clouds: Sequence[PersonCloud | None],
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
         definition: Definition | None = None,
@@ -150,7 +167,7 @@ class Fitter:
             evidence.refine_sigma(problem)
         problem.fit_shared = True  # stage 3
         for reach in _CLOUD_REACH_M[:2] if evidence.has_cloud else ():
-            problem.rows = evidence.match(problem, reach)
+            problem.rows = evidence.match(problem, reach, keep_views=False)
             evidence.observe_keypoints(problem)
             self._minimise(problem, 3)
             evidence.refine_sigma(problem)
@@ -163,15 +180,14 @@ class Fitter:
         # forearms and hands. They also determine the twist of the forearm, and with it the offset
         # of the detector's wrist, which is fixed in the frame of the forearm.
         problem.columns = columns_of(self.model, hands=hands, face=face, betas=not self.one_shape)
-        for last in (False, True):
+        for _ in range(2):
             if evidence.has_cloud:
-                problem.rows = evidence.match(problem, _CLOUD_REACH_M[-1])
+                problem.rows = evidence.match(problem, _CLOUD_REACH_M[-1], keep_views=False)
             problem.pairs = evidence.find_pairs(problem)
             evidence.refine_sigma(problem)
             evidence.observe_keypoints(problem, hands=hands, face=face)
-            solution = self._minimise(problem, 4, keep_normal=last)
-        assert solution.normal is not None
-        return self._report(problem, solution.normal.hessian, refitted)
+            solution = self._minimise(problem, 4)
+        return self._report(problem, Hessians(problem, solution), refitted)
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
         """Return the problem of stage 5 at other bodies ``base`` (N, P), without observations.
@@ -237,7 +253,7 @@ class Fitter:
         pixels = residuals[:, :, BODY].norm(dim=-1)
         return torch.where(problem.views.confidence[:, :, BODY] > 0, pixels, torch.nan)
 
-    def _report(self, problem: BodyProblem, hessian: Tensor, refitted: np.ndarray) -> BodyFit:
+    def _report(self, problem: BodyProblem, hessian: Hessians, refitted: np.ndarray) -> BodyFit:
         """Return the solution with its residuals."""
         assert problem.views is not None
         evidence, views, index = self.evidence, problem.views, problem.keypoints.index
@@ -269,7 +285,7 @@ class Fitter:
             refitted=refitted,
         )
 
-    def _minimise(self, problem: BodyProblem, trials: int, keep_normal: bool = False) -> Solution:
+    def _minimise(self, problem: BodyProblem, trials: int) -> Solution:
         """Minimise by at most ``trials`` steps, and set the problem's parameters to the result."""
         self._linearise_pose_prior(problem)
         shared = problem.shared_start()
@@ -279,7 +295,6 @@ class Fitter:
             shared if len(shared) else None,
             max_trials=trials,
             cost_tolerance=1e-3,
-            keep_normal=keep_normal,
         )
         problem.accept(solution.own, solution.shared)
         self._progress.step()

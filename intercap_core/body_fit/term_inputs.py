@@ -75,7 +75,7 @@ class CloudRows(NamedTuple):
     weight: Tensor
     """(T, N) weight, 1/m^2, 0 = no point."""
 
-    def frames(self, index: Tensor | np.ndarray) -> CloudRows:
+    def frames(self, index: Tensor | np.ndarray | slice) -> CloudRows:
         """Return the rows of the frames ``index`` (b,)."""
         return CloudRows(*(values[index] for values in self))
 

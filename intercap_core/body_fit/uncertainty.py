@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,10 +13,12 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.quality import joint_excess
 from intercap_core.body_fit.schedule import BodyFit
+from intercap_core.geometry.solve.levenberg_marquardt import BLOCK_FRAMES
 
 # Error of a joint that ten shape components leave, metres along one coordinate: 1.3 mm in the mean
 # over adults that the open body was not made from, measured (docs/body.md).
 _MODEL_SIGMA_M = 0.001
+CHUNK_FRAMES = 16  # frames whose derivatives are computed at once, limited by memory
 
 
 def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
@@ -35,15 +39,26 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     """
     own = len(fit.columns)
     betas = torch.arange(TRANSL.stop, TRANSL.stop + model.num_betas)
-    at_rest = [_eliminated(fit.hessian[at], own) for at in _chunks(len(fit.vectors))]
-    information = torch.cat([schur for _, _, schur in at_rest]).mean(0)
+    count = len(fit.vectors)
+
+    @lru_cache(maxsize=1)
+    def at_rest(block: int) -> list[tuple[Tensor, Tensor, Tensor]]:  # 0.4 MB a frame
+        hessian = fit.hessian[block : block + BLOCK_FRAMES]
+        return [_eliminated(hessian[at], own) for at in _chunks(len(hessian))]
+
+    blocks = range(0, count, BLOCK_FRAMES)
+    information = sum(torch.cat([schur for _, _, schur in at_rest(b)]).sum(0) for b in blocks)
+    assert isinstance(information, Tensor)
+    information = information / count
     counts = fit.shared_counts.double()
     information = information / (counts[:, None] * counts[None]).sqrt()
     shared_factor = torch.linalg.cholesky(information)
     model_error = _MODEL_SIGMA_M**2 * torch.eye(3).to(information)
     result = information.new_zeros(len(fit.vectors), NUM_JOINTS, 3, 3)
     excess = joint_excess(fit.parts).double()[..., None, None]
-    for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
+    for at in _chunks(count):
+        block = at.start - at.start % BLOCK_FRAMES
+        factor, answer, _ = at_rest(block)[(at.start - block) // CHUNK_FRAMES]
         # one vertex in place of all, which is dropped below, then the joints
         lin = model.linearise(
             model.parameters(fit.vectors[at]), vertex_ids=np.array([0]), joints=True
@@ -95,5 +110,5 @@ def _covariance(factor: Tensor, by: Tensor) -> Tensor:
 
 
 def _chunks(count: int) -> list[slice]:
-    """Divide frames into chunks of 16, whose derivatives fit into memory."""
-    return [slice(start, start + 16) for start in range(0, count, 16)]
+    """Divide frames into chunks."""
+    return [slice(start, start + CHUNK_FRAMES) for start in range(0, count, CHUNK_FRAMES)]

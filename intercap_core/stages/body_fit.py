@@ -18,13 +18,14 @@ from intercap_core.body.loading import OPEN_BODY, ShapePrior, load_body_file
 from intercap_core.body.model import BodyModel, check_body
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, unwrap_turns
-from intercap_core.body_fit.clouds import person_clouds, put_clouds
+from intercap_core.body_fit.clouds import PersonCloud, person_clouds, put_clouds
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.recover import JUMP_M, measure_jumps
 from intercap_core.body_fit.schedule import BodyFit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 from intercap_core.config import BodyFitSettings, BodyModels, digest
+from intercap_core.disk import DiskList
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
@@ -67,7 +68,9 @@ def run(
             "views, or one and its depth, place three keypoints of the subject's trunk; check the "
             "keypoints and the camera poses of this sequence"
         )
-    clouds = person_clouds(frames, seen, settings.points_per_frame)
+    clouds: DiskList[PersonCloud | None] = DiskList(output.parent)
+    for cloud in person_clouds(frames, seen, settings.points_per_frame):
+        clouds.append(cloud)
     definition = Definition.read(settings.keypoint_definition)
     fit = Fitter(model, seen, clouds, settings, pose_prior, definition=definition).run()
 

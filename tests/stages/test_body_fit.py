@@ -17,6 +17,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle, vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import evidence, uncertainty
 from intercap_core.body_fit.clouds import person_clouds
 from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
@@ -27,6 +28,7 @@ from intercap_core.config import BodyFitSettings, BodyModels
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve import levenberg_marquardt
 from intercap_core.geometry.solve.levenberg_marquardt import minimise
 from intercap_core.schemas import BODY_FIT, BODY_PARTS, PERSON
 from intercap_core.stages import body_fit
@@ -225,6 +227,19 @@ def test_the_same_input_gives_the_same_bytes(clothed) -> None:
     assert (folder / "again.h5").read_bytes() == (folder / "body_fit.h5").read_bytes()
 
 
+def test_a_recording_of_two_blocks_is_fitted_as_one_of_a_single_block(
+    model, tmp_path, monkeypatch
+) -> None:
+    capture = Capture(model, tmp_path, 24, cameras=3, clothing=0.01)
+    whole = capture.fit(tmp_path / "whole.h5")
+    for module in (levenberg_marquardt, evidence, uncertainty):
+        monkeypatch.setattr(module, "BLOCK_FRAMES", 16)
+    blocks = capture.fit(tmp_path / "blocks.h5")
+    np.testing.assert_allclose(blocks["joints"], whole["joints"], rtol=0, atol=1e-4)  # 0.1 mm
+    np.testing.assert_allclose(blocks["joint_sigma"], whole["joint_sigma"], rtol=1e-2)
+    assert np.array_equal(blocks["undetermined"], whole["undetermined"])
+
+
 def test_unseen_and_contradicted_parts_are_undetermined(model, clothed, tmp_path) -> None:
     """The left hand unseen in frame 1, the right leg guessed apart in frame 4."""
     capture, found, _ = clothed
@@ -332,7 +347,7 @@ def test_a_body_with_strong_blend_shapes_is_fitted(tmp_path):
     model = BodyModel(replace(file, posedirs=moves), torch.device("cpu"), torch.float32)
     capture = Capture(model, tmp_path, 2, cameras=4, pixel_noise=1.0, depth_noise_mm=3.0)
     seen = read_observations(capture.inputs.scene, capture.inputs.person)
-    clouds = person_clouds(capture.inputs.frames, seen, 800)
+    clouds = list(person_clouds(capture.inputs.frames, seen, 800))
     vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
     found = model.forward(model.parameters(vectors)).joints.numpy()
     assert 1000 * np.linalg.norm(found - capture.joints, axis=2)[:, :22].mean() < 6

@@ -22,6 +22,9 @@ from torch import Tensor
 
 # Range of damping factors. A frame stops at the maximum; with shared parameters all stop together.
 _DAMPING_RANGE = (1e-8, 1e8)
+# Frames that are linearised at once. The normal equations of a body with hands and face, their
+# factors and solutions take 1.3 MB a frame.
+BLOCK_FRAMES = 128
 
 
 class NormalEquations(NamedTuple):
@@ -64,10 +67,7 @@ class Solution:
     converged: Tensor
     """(B,) bool: the last step, or its decrease of the cost, was below the tolerance."""
     trials: int
-    """Number of steps tried."""
-    normal: NormalEquations | None = None
-    """Linearisation at the solution, if requested. The Hessian's inverse is the covariance of
-    unit-variance residuals."""
+    """Largest number of steps tried in a frame."""
 
 
 def minimise(
@@ -79,7 +79,6 @@ def minimise(
     damping: float = 1e-3,
     step_tolerance: float = 1e-5,
     cost_tolerance: float = 1e-6,
-    keep_normal: bool = False,
 ) -> Solution:
     """Minimise sum_b f_b(x_b, y).
 
@@ -91,6 +90,9 @@ def minimise(
     parameters. A frame whose Hessian cannot be factorised keeps its parameters, and its damping
     increases.
 
+    Memory is bounded by linearising ``BLOCK_FRAMES`` frames at once. Frames without shared
+    parameters are minimised block by block.
+
     Args:
         problem: the energy.
         own: (B, n) start.
@@ -99,28 +101,48 @@ def minimise(
         damping: damping factor at the start.
         step_tolerance: in units of the parameters.
         cost_tolerance: relative decrease of the cost.
-        keep_normal: return the normal equations at the solution.
     """
-    count = own.shape[0]
-    own = own.clone()
     y = own.new_zeros(0) if shared is None else shared.clone()
-    everyone = torch.arange(count)
-    normal = problem.linearise(own, y, everyone)
-    cost = normal.cost.clone()
-    lam = torch.full((count,), damping, dtype=torch.float64)
-    stale = torch.zeros(count, dtype=torch.bool)
+    everyone = torch.arange(len(own))
+    parts = [
+        _minimise(problem, own[at], y, at, max_trials, damping, step_tolerance, cost_tolerance)
+        for at in ([everyone] if len(y) else _blocks(everyone))
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    joined = (torch.cat([getattr(part, name) for part in parts])
+              for name in ("own", "cost", "converged"))  # fmt: skip
+    own, cost, converged = joined
+    return Solution(own, y, cost, converged, max(part.trials for part in parts))
+
+
+def _minimise(
+    problem: Problem,
+    own: Tensor,
+    y: Tensor,
+    frames: Tensor,
+    max_trials: int,
+    damping: float,
+    step_tolerance: float,
+    cost_tolerance: float,
+) -> Solution:
+    """Minimise over the ``frames`` (b,); see :func:`minimise`."""
+    own = own.clone()
+    linear = _Linearisation(problem, own, y, frames)
+    cost = linear.cost()
+    lam = torch.full((len(own),), damping, dtype=torch.float64)
+    stale = torch.zeros(len(own), dtype=torch.bool)
     done = torch.zeros_like(stale)
     converged = torch.zeros_like(stale)
     trials = 0
     while trials < max_trials and not bool(done.all()):
-        normal = _refresh(problem, normal, own, y, torch.nonzero(stale & ~done)[:, 0])
+        linear.refresh(own, y, torch.nonzero(stale & ~done)[:, 0])
         stale[:] = False
         index = torch.nonzero(~done)[:, 0]
-        at = normal if len(index) == count else NormalEquations(*(part[index] for part in normal))
-        step, shared_step, solved = _damped_step(at, lam[index], len(y))
+        step, shared_step, solved = linear.damped_step(lam, index)
         trials += 1
         trial, trial_y = own[index] + step.to(own.dtype), y + shared_step.to(y.dtype)
-        new, before = problem.cost(trial, trial_y, index), cost[index]
+        new, before = _cost(problem, trial, trial_y, frames[index]), cost[index]
         good = solved & (new <= before)
         if len(y):
             trial, new, good = _keep_the_better(problem, own, trial, trial_y, new, good)
@@ -145,22 +167,139 @@ def minimise(
             stale[accepted] = True
             converged[index[good & small]] = True
             done[index] = (good & small) | stuck
-    result = Solution(own, y, cost, converged, trials)
-    if keep_normal:
-        result.normal = problem.linearise(own, y, everyone)
-    return result
+    return Solution(own, y, cost, converged, trials)
 
 
-def _refresh(
-    problem: Problem, normal: NormalEquations, own: Tensor, y: Tensor, index: Tensor
-) -> NormalEquations:
-    """Update the linearisation of the frames in ``index``."""
-    if len(index) == len(own):
-        return problem.linearise(own, y, index)
-    if len(index):
-        for kept, fresh in zip(normal, problem.linearise(own[index], y, index), strict=True):
-            kept[index] = fresh
-    return normal
+def _blocks(index: Tensor) -> list[Tensor]:
+    return list(index.split(BLOCK_FRAMES))
+
+
+def _cost(problem: Problem, own: Tensor, y: Tensor, frames: Tensor) -> Tensor:
+    """Return the cost (b,) of the ``frames`` (b,), evaluated block by block."""
+    parts = zip(own.split(BLOCK_FRAMES), _blocks(frames), strict=True)
+    return torch.cat([own.new_zeros(0), *(problem.cost(part, y, at) for part, at in parts)])
+
+
+class _Linearisation:
+    """Normal equations of the ``frames`` (b,), which are kept if they are a single block."""
+
+    def __init__(self, problem: Problem, own: Tensor, y: Tensor, frames: Tensor) -> None:
+        self._problem, self._frames = problem, frames
+        self._at = own, y
+        self._kept: NormalEquations | None = None
+        if len(frames) <= BLOCK_FRAMES:
+            self._kept = problem.linearise(own, y, frames)
+
+    def cost(self) -> Tensor:
+        """Return the cost (b,) at the start."""
+        if self._kept is not None:
+            return self._kept.cost.clone()
+        return _cost(self._problem, *self._at, self._frames)
+
+    def refresh(self, own: Tensor, y: Tensor, index: Tensor) -> None:
+        """Take new parameters, of which those of the frames ``index`` have changed."""
+        self._at = own, y
+        if self._kept is None or not len(index):
+            return
+        fresh = self._problem.linearise(own[index], y, self._frames[index])
+        if len(index) == len(own):
+            self._kept = fresh
+            return
+        for kept, part in zip(self._kept, fresh, strict=True):
+            kept[index] = part
+
+    def damped_step(self, lam: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Solve the damped normal equations; lam (b,): damping factors.
+
+        Returns:
+            (k, n) own steps of the frames ``index`` (k,).
+            (m,) shared step.
+            (k,) bool, the frame's own block was factorised.
+        """
+        own, y = self._at
+        normal = self._kept
+        if normal is not None:
+            if len(index) < len(own):
+                normal = NormalEquations(*(part[index] for part in normal))
+            block = _Eliminated.of(normal, lam[index], len(y))
+            shared_step = _shared_step(block.schur, block.right, lam[index])
+            return block.step(shared_step), shared_step, block.solved
+        # solutions for unit steps of y are kept instead of the normal equations and their factors
+        schur, right = lam.new_zeros(len(y), len(y)), lam.new_zeros(len(y))
+        solutions, solved = [], []
+        for at in _blocks(index):
+            block = self._eliminated(at, lam)
+            schur += block.schur
+            right += block.right
+            solutions.append(block.solution().to(own.dtype))
+            solved.append(block.solved)
+            del block  # before the next one is computed
+        shared_step = _shared_step(schur, right, lam[index])
+        unit = torch.cat([shared_step.new_ones(1), shared_step])
+        steps = [-(solution.double() @ unit) for solution in solutions]
+        return torch.cat(steps), shared_step, torch.cat(solved)
+
+    def _eliminated(self, index: Tensor, lam: Tensor) -> _Eliminated:
+        """Linearise the frames ``index`` and eliminate their own parameters."""
+        own, y = self._at
+        normal = self._problem.linearise(own[index], y, self._frames[index])
+        return _Eliminated.of(normal, lam[index], len(y))
+
+
+class _Eliminated(NamedTuple):
+    """Damped normal equations of b frames, whose own parameters are eliminated."""
+
+    factor: Tensor
+    """(b, n, n) Cholesky factor L of the own block H = L L^T."""
+    half: Tensor
+    """(b, n, 1 + m) L^-1 [g B]."""
+    solved: Tensor
+    """(b,) bool, the own block was factorised."""
+    schur: Tensor
+    """(m, m) sum of C - B^T H^-1 B."""
+    right: Tensor
+    """(m,) sum of c - B^T H^-1 g."""
+
+    @classmethod
+    def of(cls, normal: NormalEquations, lam: Tensor, num_shared: int) -> _Eliminated:
+        """Eliminate the own parameters; lam (b,): damping factors."""
+        gradient, n = normal.gradient, normal.gradient.shape[1] - num_shared
+        a = normal.hessian[:, :n, :n].double()
+        if a.dtype == normal.hessian.dtype:
+            a = a.clone()
+        diagonal = a.diagonal(dim1=1, dim2=2)
+        diagonal += lam[:, None] * diagonal + 1e-9
+        factor, info = torch.linalg.cholesky_ex(a)
+        right = torch.cat([gradient[:, :n, None], normal.hessian[:, :n, n:]], 2).double()
+        solved = info == 0
+        if not bool(solved.all()):  # such a frame keeps its parameters while its damping grows
+            eye = torch.eye(n, dtype=a.dtype)
+            factor = torch.where(solved[:, None, None], factor, eye)
+            right = torch.where(solved[:, None, None], right, torch.zeros_like(right))
+        half = torch.linalg.solve_triangular(factor, right, upper=False)
+        flat = half.flatten(0, 1)
+        eliminated = flat[:, 1:].T @ flat
+        schur = normal.hessian[:, n:, n:].sum(0, dtype=a.dtype) - eliminated[:, 1:]
+        own_right = gradient[:, n:].sum(0, dtype=a.dtype) - eliminated[:, 0]
+        return cls(factor, half, solved, schur, own_right)
+
+    def step(self, shared_step: Tensor) -> Tensor:
+        """Return the own steps (b, n) that follow from the shared step (m,)."""
+        remains = self.half[..., :1] + self.half[..., 1:] @ shared_step[:, None]
+        return -torch.linalg.solve_triangular(self.factor.mT, remains, upper=True)[..., 0]
+
+    def solution(self) -> Tensor:
+        """Return H^-1 [g B] (b, n, 1 + m)."""
+        return torch.linalg.solve_triangular(self.factor.mT, self.half, upper=True)
+
+
+def _shared_step(schur: Tensor, right: Tensor, lam: Tensor) -> Tensor:
+    """Return the shared step (m,); lam: damping factors of all frames."""
+    if not len(right):
+        return right
+    damped = schur.clone()
+    damped.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
+    return -torch.linalg.solve(damped, right)
 
 
 def _keep_the_better(
@@ -181,49 +320,10 @@ def _keep_the_better(
     """
     bad = torch.nonzero(~good)[:, 0]
     if len(bad):
-        stayed = problem.cost(own[bad], trial_y, bad)
+        stayed = _cost(problem, own[bad], trial_y, bad)
         better = stayed <= new[bad]
         trial[bad] = torch.where(better[:, None], own[bad], trial[bad])
         new[bad] = torch.minimum(stayed, new[bad])
         good = good.clone()
         good[bad] = ~better
     return trial, new, good
-
-
-def _damped_step(
-    normal: NormalEquations, lam: Tensor, num_shared: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve the damped normal equations; lam (b,): damping factors.
-
-    Returns:
-        (b, n) own steps.
-        (m,) shared step.
-        (b,) bool, the frame's own block was factorised.
-    """
-    gradient, n = normal.gradient, normal.gradient.shape[1] - num_shared
-    a = normal.hessian[:, :n, :n].double()
-    if a.dtype == normal.hessian.dtype:
-        a = a.clone()
-    diagonal = a.diagonal(dim1=1, dim2=2)
-    diagonal += lam[:, None] * diagonal + 1e-9
-    factor, info = torch.linalg.cholesky_ex(a)
-    right = torch.cat([gradient[:, :n, None], normal.hessian[:, :n, n:]], 2).double()
-    solved = info == 0
-    if not bool(solved.all()):  # such a frame keeps its parameters while its damping grows
-        eye = torch.eye(n, dtype=a.dtype)
-        factor = torch.where(solved[:, None, None], factor, eye)
-        right = torch.where(solved[:, None, None], right, torch.zeros_like(right))
-    # H = L L^T; ``half`` = L^-1 [g B] eliminates the frames from the equations of y
-    half = torch.linalg.solve_triangular(factor, right, upper=False)
-    shared_step = right.new_zeros(num_shared)
-    if num_shared:
-        flat = half.flatten(0, 1)
-        eliminated = flat[:, 1:].T @ flat
-        schur = normal.hessian[:, n:, n:].sum(0, dtype=a.dtype) - eliminated[:, 1:]
-        schur.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
-        shared_step = -torch.linalg.solve(
-            schur, gradient[:, n:].sum(0, dtype=a.dtype) - eliminated[:, 0]
-        )
-    remains = half[..., :1] + half[..., 1:] @ shared_step[:, None]
-    step = -torch.linalg.solve_triangular(factor.mT, remains, upper=True)[..., 0]
-    return step, shared_step, solved

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from intercap_core.geometry.solve import levenberg_marquardt
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations, minimise
 
 
@@ -100,6 +101,27 @@ def test_the_arrow_step_equals_the_dense_step() -> None:
     found = minimise(problem, own, shared, max_trials=1, damping=0.0)
     torch.testing.assert_close(found.own[:, 0], own[:, 0] + expected[:3], atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(found.shared, shared + expected[3:], atol=1e-6, rtol=1e-6)
+
+
+def test_blocks_of_frames_give_the_same_result(monkeypatch) -> None:
+    times = torch.linspace(0, 1, 12, dtype=torch.float64)
+    a = torch.linspace(-2, 2, 7, dtype=torch.float64)[:, None]
+    problem = Exponentials(a * torch.exp(1.3 * times), times, torch.linspace(0.2, 4, 7).double())
+    y, valley = torch.zeros(1).double(), torch.linspace(-3, 3, 14).double().reshape(7, 2)
+    results = []
+    for frames in (128, 3):
+        monkeypatch.setattr(levenberg_marquardt, "BLOCK_FRAMES", frames)
+        results.append(
+            (
+                minimise(problem, torch.ones_like(a), y, max_trials=5),
+                minimise(Rosenbrock(), valley, max_trials=9),
+            )
+        )
+    for whole, blocks in zip(*results, strict=True):
+        torch.testing.assert_close(blocks.own, whole.own, atol=1e-9, rtol=0)
+        torch.testing.assert_close(blocks.shared, whole.shared, atol=1e-9, rtol=0)
+        torch.testing.assert_close(blocks.cost, whole.cost, atol=1e-9, rtol=1e-6)
+        assert blocks.trials == whole.trials
 
 
 def test_cost_never_rises_and_a_broken_frame_stays() -> None:
