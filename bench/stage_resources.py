@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -177,16 +178,16 @@ def run_apart(settings: Path, stage: str, folder: Path, frames: int) -> str | No
     return None if done.returncode else done.stdout.splitlines()[-1]
 
 
-def measure(settings: Path, frames: int) -> None:
-    """Print seconds and megabytes of each stage that reads artefacts, on ``frames`` frames."""
+def measure(settings: Path, frames: int, stages: Sequence[str]) -> None:
+    """Print seconds and megabytes of ``stages``, which read artefacts, on ``frames`` frames."""
     project = load_project(settings)
     sequence = next(iter(project.sequences))
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
-        made = {name for stage in FROM_ARTEFACTS for name in STAGES[stage].reads}
+        made = {name for stage in stages for name in STAGES[stage].reads}
         for stage in (name for name in STAGES if name in made):
             source = project.artefact(sequence, stage)
             lengthen(source, stage, Path(folder) / f"{stage}.h5", frames)
-        for stage in FROM_ARTEFACTS:
+        for stage in stages:
             print(run_apart(settings, stage, Path(folder), frames) or f"{stage} failed", flush=True)
 
 
@@ -204,6 +205,7 @@ def _main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
     parser.add_argument("--frames", type=int, nargs="+", default=[45, 300])
+    parser.add_argument("--stages", nargs="+", choices=FROM_ARTEFACTS, default=FROM_ARTEFACTS)
     parser.add_argument("--stage", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -211,7 +213,7 @@ def _main() -> None:
         run(given.settings, given.stage, given.folder, given.frames[0])
         return
     for frames in given.frames:
-        measure(given.settings, frames)
+        measure(given.settings, frames, given.stages)
 
 
 if __name__ == "__main__":
