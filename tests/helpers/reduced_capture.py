@@ -87,6 +87,8 @@ class Reduction:
         if key in ("mask_offsets", "mask_rle", "beside_offsets", "beside_rle"):
             what, which = key.split("_")
             return self._masks(old, what, names, kept)[which == "rle"]
+        if key.startswith(("cloud_", "rim_")) and key != "cloud_residual":
+            return self._of_cloud(old, key.partition("_")[0], key, names, kept)
         if key == "pairs" or key.startswith("pair_"):
             return old[key][:0]
         values = old[key].copy()
@@ -106,6 +108,25 @@ class Reduction:
             elif dim == "C":
                 values = values.take(kept, axis)
         return list(values) if values.dtype == object else values
+
+    def _of_cloud(
+        self, old: Artefact, prefix: str, key: str, names: list[str], kept: list[int]
+    ) -> np.ndarray:
+        """A dataset of the person's clouds, with the rows of the cameras and sets that are kept."""
+        if key == "cloud_window":
+            return old[key][: self.sets][:, kept]
+        offsets, view = old[f"{prefix}_offsets"], old[f"{prefix}_view"]
+        set_of_row = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+        until = np.array([(self.images_until or {}).get(n, len(offsets)) for n in names])
+        seen = np.isin(view, kept) & (set_of_row < until[view])
+        if prefix == "cloud":
+            seen &= np.array([_has(self.depth, name) for name in names])[view]
+        sets = len(offsets) - 1 if self.sets is None else min(self.sets, len(offsets) - 1)
+        seen &= set_of_row < sets
+        if key == f"{prefix}_offsets":
+            counts = np.bincount(set_of_row[seen], minlength=sets)
+            return np.concatenate([[0], np.cumsum(counts)])
+        return np.searchsorted(kept, view[seen]) if key.endswith("_view") else old[key][seen]
 
     def _masks(
         self, old: Artefact, what: str, names: list[str], kept: list[int]
