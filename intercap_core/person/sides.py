@@ -102,6 +102,8 @@ def images_with_stated_sides(
 
 def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
     """Keypoints (T, C, 135, n) with left and right exchanged in the images ``stated`` (T, C)."""
+    if not stated.any():
+        return keypoints
     return np.where(stated[..., None, None], swap_sides(keypoints), keypoints)
 
 
@@ -120,7 +122,7 @@ def hold_sides(
         stated: (T, C) bool, images with stated sides.
     """
     wrong = np.zeros((len(keypoints), len(LIMBS)), bool)
-    for number, limb in enumerate(LIMBS):
+    for number, limb in enumerate(LIMBS if stated.any() else ()):
         own, other = keypoints[:, :, limb], swap_sides(given)[:, :, limb]
         same = (own == given[:, :, limb]).all((2, 3))
         exchanged = (own == other).all((2, 3))

@@ -136,6 +136,7 @@ def run(
             max_error_px=settings.max_reprojection_px,
         )
         keypoints, points = hold_sides(moved[..., [3, 4, 2]], points, given, stated)
+        del moved, given  # 50 kB a set
         lifted = lifter.fill(person, keypoints, points)
         fill_middles(points.points.reshape(found.num_sets, NUM_KEYPOINTS, 3))
         missing = ((person != NOBODY).sum(1) < 2) & ~lifted

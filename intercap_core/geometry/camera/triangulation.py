@@ -66,10 +66,18 @@ def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
     A direction has z = 1 in the camera's frame; it is not a unit vector.
     """
     rays = np.empty((*pixels.shape[:-1], 3))
-    for c, camera in enumerate(rig):
-        directions = camera.colour.unproject(pixels[..., c, :, :])
-        rays[..., c, :, :] = directions @ camera.master_from_colour[:3, :3].T
+    whole = [slice(None)]
+    for at in whole if pixels.ndim == 3 else _blocks(len(pixels), pixels[:1].size // 2):
+        for c, camera in enumerate(rig):
+            directions = camera.colour.unproject(pixels[at][..., c, :, :])
+            rays[at][..., c, :, :] = directions @ camera.master_from_colour[:3, :3].T
     return rays
+
+
+def _blocks(count: int, size: int = 1) -> list[slice]:
+    """Divide rows of ``size`` pixels into blocks, whose intermediate results take 50 MB."""
+    together = max(1, 160_000 // max(size, 1))
+    return [slice(start, start + together) for start in range(0, count, together)]
 
 
 def midpoints(
@@ -119,8 +127,11 @@ def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
 
 def reproject(points: np.ndarray, rig: Rig) -> np.ndarray:
     """Return the pixels (N, C, 2) of points (N, 3), master frame, in every view."""
-    seen = np.moveaxis(apply(rig.colour_from_master, points), 0, 1)
-    return projection.project(seen, rig.colour_parameters)
+    pixels = np.empty((len(points), len(rig), 2))
+    for at in _blocks(len(points), len(rig)):
+        seen = np.moveaxis(apply(rig.colour_from_master, points[at]), 0, 1)
+        pixels[at] = projection.project(seen, rig.colour_parameters)
+    return pixels
 
 
 def triangulate(
