@@ -1,10 +1,13 @@
 """Seconds and peak memory of every stage at several sequence lengths.
 
-    python -m bench.stage_resources config/bench/config.yaml --frames 45 300
+    python -m bench.stage_resources config/bench/config.yaml --frames 45 300 1000
 
 The first sequence of the project, which must be computed, is extended to each length. Each stage
-runs in a separate process and prints one row. The resource needs of the stages (``Stage.resources``
-in ``intercap_core.stage_list``) are derived from it.
+runs in a separate process and prints one row: stage, frames, CPU seconds and peak memory. From the
+two greatest lengths follow the law of each stage, linear in the frames, and
+``scale.long_recording_mb``: the largest peak of a recording of 10 minutes at 30 frames per second
+by these laws. The resource needs of the stages (``Stage.resources`` in
+``intercap_core.stage_list``) are derived from it.
 
 A recording is repeated forward and backward, so that motion is continuous: every dataset with a
 frame axis in the stage's inputs is extended. Images are not copied; the new frames refer to the
@@ -21,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +37,7 @@ from intercap_core.stage_list import STAGES
 
 FROM_ARTEFACTS = tuple(name for name, stage in STAGES.items() if len(stage.reads) > 1)
 MEGABYTE = 1 << 10  # in kilobytes
+LONG_RECORDING = 18_000  # frames: 10 minutes at 30 per second
 # Ragged datasets: offsets with one entry per frame or image (of all cameras, or within a camera's
 # group), and the datasets that they index.
 _PER_IMAGE = {
@@ -158,7 +163,7 @@ def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) 
         raise UserError(
             f"{sequence}: the joint stage failed on {count} frames; see the lines above"
         )
-    return float(row.split()[-2])
+    return row.mb
 
 
 def peak_mb() -> float:
@@ -168,37 +173,80 @@ def peak_mb() -> float:
     return int(peak) / MEGABYTE
 
 
-def run_apart(settings: Path, stage: str, folder: Path, frames: int) -> str | None:
+class Row(NamedTuple):
+    """Figures of one stage."""
+
+    stage: str
+    frames: int
+    seconds: float
+    """Seconds of CPU."""
+    mb: float
+    """Peak resident memory, megabytes."""
+
+
+def run_apart(settings: Path, stage: str, folder: Path, frames: int) -> Row | None:
     """Row of a stage that runs in a separate process on the artefacts in ``folder``."""
     done = subprocess.run(
         [sys.executable, "-m", "bench.stage_resources", str(settings), "--stage", stage,
          "--folder", str(folder), "--frames", str(frames)],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    return None if done.returncode else done.stdout.splitlines()[-1]
+    if done.returncode:
+        return None
+    seconds, mb = done.stdout.splitlines()[-1].split()
+    return Row(stage, frames, float(seconds), float(mb))
 
 
-def measure(settings: Path, frames: int, stages: Sequence[str]) -> None:
-    """Print seconds and megabytes of ``stages``, which read artefacts, on ``frames`` frames."""
+def measure(settings: Path, frames: int, stages: Sequence[str]) -> list[Row]:
+    """Print and return the rows of ``stages``, which read artefacts, on ``frames`` frames."""
     project = load_project(settings)
     sequence = next(iter(project.sequences))
+    rows = []
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         made = {name for stage in stages for name in STAGES[stage].reads}
         for stage in (name for name in STAGES if name in made):
             source = project.artefact(sequence, stage)
             lengthen(source, stage, Path(folder) / f"{stage}.h5", frames)
         for stage in stages:
-            print(run_apart(settings, stage, Path(folder), frames) or f"{stage} failed", flush=True)
+            row = run_apart(settings, stage, Path(folder), frames)
+            if row is None:
+                print(f"{stage} failed", flush=True)
+                continue
+            print(f"{stage}\t{frames}\t{row.seconds:.1f} s\t{row.mb:.0f} MB", flush=True)
+            rows.append(row)
+    return rows
+
+
+def print_laws(rows: Sequence[Row]) -> None:
+    """Print the law of each stage by its two greatest lengths, and what follows for a long one."""
+    largest: dict[str, float] = {}
+    for stage in dict.fromkeys(row.stage for row in rows):
+        own = sorted((row for row in rows if row.stage == stage), key=lambda row: row.frames)[-2:]
+        if len(own) < 2:
+            continue
+        low, high = own
+        count = high.frames - low.frames
+        per_frame, each = (high.mb - low.mb) / count, (high.seconds - low.seconds) / count
+        print(
+            f"{stage}: {high.mb - per_frame * high.frames:.0f} MB + {per_frame:.3f} MB a frame, "
+            f"{high.seconds - each * high.frames:.0f} s + {each:.3f} s a frame"
+        )
+        largest[stage] = high.mb + per_frame * (LONG_RECORDING - high.frames)
+    if largest:
+        stage = max(largest, key=largest.__getitem__)
+        print(
+            f"scale.long_recording_mb {largest[stage]:.0f} ({stage}; {LONG_RECORDING} frames, "
+            f"extrapolated from {max(row.frames for row in rows)})"
+        )
 
 
 def run(settings: Path, stage: str, folder: Path, frames: int) -> None:
-    """Run one stage on a folder's artefacts and print its row."""
+    """Run one stage on a folder's artefacts and print CPU seconds and peak megabytes."""
     project = load_project(settings)
-    start = time.monotonic()
     inputs = {name: folder / f"{name}.h5" for name in STAGES[stage].reads}
     output = folder / f"{stage}.new"
     run_step(stage, project, next(iter(project.sequences)), inputs=inputs, output=output)
-    print(f"{stage}\t{frames}\t{time.monotonic() - start:.1f} s\t{peak_mb():.0f} MB", flush=True)
+    print(f"{time.process_time():.2f} {peak_mb():.1f}", flush=True)
 
 
 def _main() -> None:
@@ -212,8 +260,7 @@ def _main() -> None:
     if given.stage:
         run(given.settings, given.stage, given.folder, given.frames[0])
         return
-    for frames in given.frames:
-        measure(given.settings, frames, given.stages)
+    print_laws([row for n in given.frames for row in measure(given.settings, n, given.stages)])
 
 
 if __name__ == "__main__":
