@@ -64,7 +64,10 @@ def kernel_modules(package: Path = PACKAGE) -> dict[str, bytes]:
     parsing and may find too many modules, but not too few.
     """
     sources = {name.encode(): text for name, text in _sources(package).items()}
-    waiting = [name for name, text in sources.items() if _USES_NUMBA.search(text)]
+    # the first condition takes a tenth of the time of the second
+    waiting = [
+        name for name, text in sources.items() if b"numba" in text and _USES_NUMBA.search(text)
+    ]
     reached: set[bytes] = set()
     while waiting:
         name = waiting.pop()

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.surface import Samples
+from intercap_core.body_fit.surface import BODY_LENGTH_M, Samples
 from intercap_core.body_fit.term_inputs import Pairs
-from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 # A sample less than this outside of another part also becomes a pair, metres, since it may
@@ -124,7 +124,9 @@ class SelfContact(NamedTuple):
 def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
     """Return the thickness (N,) of the body at each vertex along its normal, metres."""
     normals = vertex_normals(points, faces)[vertex]
-    return DistanceField(points, faces).first_hit(points[vertex] - 1e-3 * normals, -normals)
+    start = points[vertex] - 1e-3 * normals
+    surface = SurfaceTree(points, faces).shaped(points)
+    return BODY_LENGTH_M * surface.first_hit(start, start - BODY_LENGTH_M * normals)
 
 
 def _geodesic_distances(

@@ -20,11 +20,12 @@ from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.geometry.rigid import surfaces as rigid_surfaces
-from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 
 # Scale of unit normals n in the distance of a match, |p - q|^2 + (scale |n_p - n_q|)^2: metres per
 # radian. Tuned on the studio.
 NORMAL_LENGTH_M = 0.06
+BODY_LENGTH_M = 3.0  # longer than any body
 # Largest distance of a matched point from the line through its vertex along the normal, metres.
 # Tuned on the studio.
 MATCH_SIDEWAYS_M = 0.03
@@ -164,7 +165,10 @@ def _flag_outer_skin(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -
     head = [JOINT_INDEX[n] for n in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")]
     ids = np.flatnonzero(outer & np.isin(joint, head))
     normals = rigid_surfaces.vertex_normals(points, faces)[ids]
-    outer[ids[DistanceField(points, faces).met(points[ids] + 1e-3 * normals, normals)]] = False
+    inner = np.zeros(len(ids), bool)
+    surface = SurfaceTree(points, faces).shaped(points)
+    surface.blocks(points[ids] + 1e-3 * normals, points[ids] + BODY_LENGTH_M * normals, inner)
+    outer[ids[inner]] = False
     return outer
 
 

@@ -26,7 +26,7 @@ from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.flags import Flags
-from intercap_core.formats.recordings.behave import FRAME_FOLDER
+from intercap_core.formats.recordings.numbering import FRAME_FOLDER
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
 INTERCAP = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # names of result files, newest first

@@ -17,7 +17,6 @@ from pydantic import BaseModel
 from intercap_core.annotation import Annotation
 from intercap_core.config import BodyModels, Config
 from intercap_core.entries import SequenceEntry
-from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.formats.released import intercap_file
 from intercap_core.inputs.files import referenced_files
@@ -235,6 +234,9 @@ def _split_row(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
         else:
             values[name] = value
     if "calibration" in row.model_fields_set and row.layout == "behave":
+        # imports the readers of images and videos
+        from intercap_core.formats.recordings.behave import find_intrinsics_folder
+
         lenses = find_intrinsics_folder(row.calibration)
         paths |= {lenses.name: lenses} if lenses is not None else {}
     return values, paths

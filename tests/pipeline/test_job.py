@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import subprocess
 import sys
 from pathlib import Path
 
@@ -46,3 +47,28 @@ def test_fault_is_one_write_that_begins_a_line(
     failure = last_failure(tmp_path / "logs")
     assert failure is not None
     assert says.splitlines()[0].partition("failed: ")[2] in failure
+
+
+@pytest.mark.parametrize(
+    ("stages", "libraries"),
+    [
+        (("frames",), {"scipy", "numba", "torch", "trimesh", "open3d.cpu.pybind"}),
+        (("detections",), {"scipy.spatial", "torch", "trimesh", "open3d.cpu.pybind"}),
+        (("scene", "person"), {"torch", "trimesh", "open3d.cpu.pybind"}),
+        (("object_track",), {"torch"}),
+        (("body_fit",), {"trimesh", "open3d.cpu.pybind"}),
+        (("joint", "metrics"), {"pandas", "scipy.stats", "matplotlib", "torch._refs"}),
+    ],
+)
+def test_stages_import_no_library_that_they_do_not_use(tmp_path, stages, libraries):
+    words = f"""
+import importlib, sys
+from intercap_core.pipeline.job import job
+with job("start", {str(tmp_path / "log")!r}):
+    import intercap_core.pipeline.step
+    for stage in {stages!r}:
+        importlib.import_module(f"intercap_core.stages.{{stage}}")
+print(*{libraries!r} & {{*sys.modules}})
+"""
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
+    assert not done.stdout.split()

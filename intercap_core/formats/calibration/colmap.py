@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import (
@@ -124,6 +123,8 @@ def _pose(image: _Image, path: Path) -> np.ndarray:
             f"{path}: image {quoted(image.name)} has no unit quaternion and translation; export "
             "the model again"
         )
+    from scipy.spatial.transform import Rotation  # slow import; all readers are imported
+
     return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.translation))
 
 

@@ -10,10 +10,9 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
-from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
+from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid, rotation_exp
 from intercap_core.inputs.documents import read_object
 from intercap_core.inputs.files import printable, quoted
 
@@ -135,7 +134,7 @@ def rotation_matrix(where: Path | str, vector: np.ndarray) -> np.ndarray:
             f"{where}: rotation vector R has length {length:.4g}, expected radians, at most a "
             "whole turn (6.28); convert degrees to radians"
         )
-    return Rotation.from_rotvec(vector).as_matrix()
+    return rotation_exp(vector)
 
 
 def check_camera_name(path: Path, name: str) -> None:

@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import (
@@ -28,7 +27,7 @@ from intercap_core.formats.calibration.opencv import (
     read_opencv_calibration,
 )
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rotation_log
 from intercap_core.plugins import modules_of
 
 
@@ -209,8 +208,8 @@ def group_images_by_camera(
         for image, _, pose in own[1:]:
             distance = float(np.linalg.norm(invert(pose)[:3, 3] - invert(first_pose)[:3, 3]))
             distance *= scale or 0.0
-            rotation = Rotation.from_matrix(pose[:3, :3] @ first_pose[:3, :3].T)
-            angle = np.degrees(rotation.magnitude())
+            turn = rotation_log(pose[:3, :3] @ first_pose[:3, :3].T)
+            angle = np.degrees(np.linalg.norm(turn))
             # Reconstructions of rooms are accurate to millimetres and tenths of a degree.
             if distance > 0.01 or angle > 0.3:
                 raise UserError(

@@ -24,6 +24,7 @@ from intercap_core.formats.calibration.extrinsics import (
 )
 from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
+from intercap_core.formats.recordings.numbering import FRAME_FOLDER
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
@@ -31,7 +32,6 @@ from intercap_core.inputs.documents import read_json, read_object
 from intercap_core.inputs.files import UnreadableFile
 
 MASTER = "k1"
-FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")
 IMAGE_FILE = re.compile(r"k(\d{1,2})\.(color\.(?:jpe?g|png)|depth\.png)", re.IGNORECASE)
 KINECT_FOLDER = re.compile(r"k?(\d{1,2})")
 

@@ -21,6 +21,8 @@ _WHOLE = re.compile(r"\d{1,25}")
 _DECIMAL = re.compile(r"\d{1,15}(?:\.\d{1,9})?")
 _LAST_DECIMAL = re.compile(r"(\d+)\.(\d+)(?=\D*$)")  # the last number of a name
 
+FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")  # BEHAVE's folder of one time, seconds
+
 NumberingKind = Literal["number", "time", "order"]
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy import fft
+from numpy import fft
 
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
@@ -81,7 +81,7 @@ def estimate_delay(first: Sound, second: Sound) -> Delay | None:
     if last < size:  # all windows would overlap, so that their agreement proves nothing
         return None
     places = np.unique(np.linspace(0, last, 8).astype(int))
-    nfft = fft.next_fast_len(len(long.samples) + size, real=True)
+    nfft = 1 << (len(long.samples) + size - 1).bit_length()  # fast
     whole = fft.rfft(long.samples, nfft)
     lags = [
         lag - place

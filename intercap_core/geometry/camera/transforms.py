@@ -7,12 +7,14 @@ turns the object about its own origin, and a shift d (m) of that origin::
 
 This is the exponential map of SO(3) x R^3, not that of SE(3): the rotation does not carry the
 origin along a helix. The derivatives of the energy terms belong to this update.
+
+SciPy's rotations are imported where they are used: every job imports this module, and many read
+no rotation vector.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 def invert(a_from_b: np.ndarray) -> np.ndarray:
@@ -68,11 +70,15 @@ def step_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def rotation_exp(vector: np.ndarray) -> np.ndarray:
     """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
+    from scipy.spatial.transform import Rotation
+
     flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
     return flat.reshape(*vector.shape[:-1], 3, 3)
 
 
 def rotation_log(rotation: np.ndarray) -> np.ndarray:
     """Return rotation vectors (..., 3), rad, of length at most pi, of matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(*rotation.shape[:-2], 3)

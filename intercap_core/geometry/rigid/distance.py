@@ -22,7 +22,6 @@ from typing import Any
 
 import igl
 import numpy as np
-import trimesh
 
 # Directions of rays whose crossings are counted. A point is outside if the first ray has an even
 # number of crossings (no error on 10,000 points). Else all five vote, since a ray may pass along an
@@ -242,6 +241,8 @@ class _OpenSurface:
         self._vertices = vertices.astype(np.float64)
         self._faces = faces.astype(np.int64)
         self._low, self._high = vertices.min(0), vertices.max(0)
+        import trimesh  # slow import, which closed surfaces do not need
+
         hull = trimesh.convex.convex_hull(self._vertices)
         self._hull = build_scene(
             np.asarray(hull.vertices, np.float32), np.asarray(hull.faces, np.uint32), threads

@@ -121,14 +121,28 @@ class ShapedSurface:
 
         Entries that are already set are skipped.
         """
-        _block(
+        blocked |= self._hits(starts, ends, np.where(blocked, 0.0, np.inf), first=False) <= 1
+
+    def first_hit(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return where segments ``starts`` to ``ends`` (N, 3) first hit the mesh, from either side.
+
+        (N,) shares of the segments' lengths, inf for a segment that does not hit it.
+        """
+        return self._hits(starts, ends, np.full(len(starts), np.inf), first=True)
+
+    def _hits(
+        self, starts: np.ndarray, ends: np.ndarray, shares: np.ndarray, *, first: bool
+    ) -> np.ndarray:
+        _hit(
             np.ascontiguousarray(starts, np.float64),
             np.ascontiguousarray(ends, np.float64),
             self._triangles,
             self._boxes,
             self._levels,
-            blocked,
+            first,
+            shares,
         )
+        return shares
 
 
 def _closed(faces: np.ndarray) -> bool:
@@ -254,30 +268,32 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
 
 
 @numba.njit(cache=True, nogil=True)
-def _block(starts, ends, triangles, boxes, levels, blocked):
-    """Set ``blocked`` (M,) bool of the segments ``starts`` to ``ends`` (M, 3) that hit the mesh.
+def _hit(starts, ends, triangles, boxes, levels, first, shares):
+    """Set ``shares`` (M,) of the segments ``starts`` to ``ends`` (M, 3) that hit the mesh.
 
-    Hits count from either side, and entries that are set are skipped. The face that was hit last is
-    tried first, so consecutive segments should be close. Otherwise the tree is traversed, without
-    the nodes whose boxes the segment misses (slab test).
+    A share is the length up to the first hit, or without ``first`` to any hit, by that of the
+    segment. Hits count from either side, and finite entries are skipped. The face that was hit last
+    is tried first, so consecutive segments should be close. Then the tree is traversed, without the
+    nodes whose boxes the segment misses (slab test).
     """
     leaves, count = 1 << levels, len(triangles)
     stack = np.empty(levels + 2, np.int32)
     last = 0
     for m in range(len(starts)):
-        if blocked[m]:
+        if shares[m] < np.inf:
             continue
         x, y, z = starts[m, 0], starts[m, 1], starts[m, 2]
         u, v, w = ends[m, 0] - x, ends[m, 1] - y, ends[m, 2] - z
-        if _meets(x, y, z, u, v, w, triangles, last):
-            blocked[m] = True
+        share = _meets(x, y, z, u, v, w, triangles, last)
+        if share < np.inf and not first:
+            shares[m] = share
             continue
         a, b, c = _inverse(u), _inverse(v), _inverse(w)
         size, stack[0] = 1, 0
         while size:
             size -= 1
             node = stack[size]
-            near, far = 0.0, 1.0  # part of the segment within the box, as shares of its length
+            near, far = 0.0, min(1.0, share)  # shares of the segment within the box
             for k in range(3):
                 o, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
                 entry, leave = (boxes[node, k] - o) * over, (boxes[node, 3 + k] - o) * over
@@ -290,10 +306,13 @@ def _block(starts, ends, triangles, boxes, levels, blocked):
                 continue
             leaf = node - leaves + 1
             for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
-                if _meets(x, y, z, u, v, w, triangles, at):
-                    blocked[m], last = True, at
-                    size = 0
-                    break
+                found = _meets(x, y, z, u, v, w, triangles, at)
+                if found < share:
+                    share, last = found, at
+                    if not first:
+                        size = 0
+                        break
+        shares[m] = share
 
 
 @numba.njit(inline="always")
@@ -304,25 +323,25 @@ def _inverse(value):
 
 @numba.njit(cache=True, nogil=True)
 def _meets(x, y, z, u, v, w, triangles, at):
-    """Return whether the segment from (x, y, z) by (u, v, w) hits one of triangles (F, 3, 3)
-    (Moeller and Trumbore 1997)."""
+    """Return the share of the segment from (x, y, z) by (u, v, w) before it hits one of triangles
+    (F, 3, 3), inf if it does not (Moeller and Trumbore 1997)."""
     ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
     bx, by, bz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
     cx, cy, cz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
     px, py, pz = v * cz - w * cy, w * cx - u * cz, u * cy - v * cx
     volume = bx * px + by * py + bz * pz
     if volume == 0:
-        return False
+        return np.inf
     tx, ty, tz = x - ax, y - ay, z - az
     s = (tx * px + ty * py + tz * pz) / volume
     if not 0 <= s <= 1:
-        return False
+        return np.inf
     qx, qy, qz = ty * bz - tz * by, tz * bx - tx * bz, tx * by - ty * bx
     t = (u * qx + v * qy + w * qz) / volume
     if t < 0 or s + t > 1:
-        return False
+        return np.inf
     along = (cx * qx + cy * qy + cz * qz) / volume
-    return 0 <= along <= 1
+    return along if 0 <= along <= 1 else np.inf
 
 
 @numba.njit(cache=True, nogil=True)

@@ -127,6 +127,11 @@ def test_blocked_segments_equal_rays_of_embree(mesh, kind: str) -> None:
     grazing = found[clear] != expected[clear]  # single precision decides at an edge
     assert grazing.mean() < (0.02 if kind == "grid" else 5e-4)
     assert 0.02 < expected.mean() < 0.98
+    share = SurfaceTree(vertices, faces).shaped(vertices).first_hit(starts, ends)
+    np.testing.assert_array_equal(share <= 1, found)
+    first = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+    both = clear & found & (first <= 1)
+    assert (np.abs(share - first)[both] > 1e-4).mean() < (0.02 if kind == "grid" else 5e-4)
     before = np.random.default_rng(1).random(len(starts)) < 0.5
     again = before.copy()
     SurfaceTree(vertices, faces).shaped(vertices).blocks(starts, ends, again)
