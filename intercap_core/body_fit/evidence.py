@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -362,13 +362,16 @@ class Evidence:
             only: (N,) index of the only camera used in each frame; None = all cameras.
             keep_views: keep the measurements of each camera in ``by_view``, 110 kB a frame.
         """
-        rows, kept = [], []
-        for frames in _blocks(len(self.frames)):
+        count, size, new = len(self.frames), len(self.samples.vertex), problem.base.new_empty
+        rows = CloudRows(new(count, size), new(count, size, 3), new(count, size))
+        problem.rows, kept = None, []  # those of the last matching are not used
+        for frames in _blocks(count):
             self.by_view = self._match_frames(problem, frames, reach, only)
-            rows.append(self.rows(self.by_view.points))
+            for whole, part in zip(rows, self.rows(self.by_view.points), strict=True):
+                whole[frames] = part
             kept += [self.by_view] if keep_views else []
-        self.by_view = _joined(ViewDistances, kept) if keep_views else None
-        return _joined(CloudRows, rows)
+        self.by_view = _joined(kept) if keep_views else None
+        return rows
 
     def _match_frames(
         self, problem: BodyProblem, frames: slice, reach: float, only: np.ndarray | None
@@ -448,12 +451,10 @@ def _median_confidence(confidence: np.ndarray) -> np.ndarray:
     return median
 
 
-Rows = TypeVar("Rows", CloudRows, ViewDistances)
-
-
-def _joined(kind: type[Rows], parts: list[Rows]) -> Rows:
+def _joined(parts: list[ViewDistances]) -> ViewDistances:
     """Join the frames of all parts."""
-    return parts[0] if len(parts) == 1 else kind(*map(torch.cat, zip(*parts, strict=True)))
+    whole = (torch.cat(values) for values in zip(*parts, strict=True))
+    return parts[0] if len(parts) == 1 else ViewDistances(*whole)
 
 
 def _blocks(count: int) -> list[slice]:

@@ -25,6 +25,9 @@ _DAMPING_RANGE = (1e-8, 1e8)
 # Frames that are linearised at once. The normal equations of a body with hands and face, their
 # factors and solutions take 1.3 MB a frame.
 BLOCK_FRAMES = 128
+# Blocks are eliminated a second time in longer recordings, since their solutions for unit steps of
+# the shared parameters take 60 kB a frame.
+KEPT_FRAMES = 512
 
 
 class NormalEquations(NamedTuple):
@@ -225,18 +228,22 @@ class _Linearisation:
             shared_step = _shared_step(block.schur, block.right, lam[index])
             return block.step(shared_step), shared_step, block.solved
         # solutions for unit steps of y are kept instead of the normal equations and their factors
+        keep = len(index) <= KEPT_FRAMES
         schur, right = lam.new_zeros(len(y), len(y)), lam.new_zeros(len(y))
         solutions, solved = [], []
         for at in _blocks(index):
             block = self._eliminated(at, lam)
             schur += block.schur
             right += block.right
-            solutions.append(block.solution().to(own.dtype))
+            solutions += [block.solution().to(own.dtype)] if keep else []
             solved.append(block.solved)
             del block  # before the next one is computed
         shared_step = _shared_step(schur, right, lam[index])
-        unit = torch.cat([shared_step.new_ones(1), shared_step])
-        steps = [-(solution.double() @ unit) for solution in solutions]
+        if keep:
+            unit = torch.cat([shared_step.new_ones(1), shared_step])
+            steps = [-(solution.double() @ unit) for solution in solutions]
+        else:
+            steps = [self._eliminated(at, lam).step(shared_step) for at in _blocks(index)]
         return torch.cat(steps), shared_step, torch.cat(solved)
 
     def _eliminated(self, index: Tensor, lam: Tensor) -> _Eliminated:

@@ -109,19 +109,21 @@ def test_blocks_of_frames_give_the_same_result(monkeypatch) -> None:
     problem = Exponentials(a * torch.exp(1.3 * times), times, torch.linspace(0.2, 4, 7).double())
     y, valley = torch.zeros(1).double(), torch.linspace(-3, 3, 14).double().reshape(7, 2)
     results = []
-    for frames in (128, 3):
+    for frames, kept in ((128, 128), (3, 128), (3, 3)):
         monkeypatch.setattr(levenberg_marquardt, "BLOCK_FRAMES", frames)
+        monkeypatch.setattr(levenberg_marquardt, "KEPT_FRAMES", kept)
         results.append(
             (
                 minimise(problem, torch.ones_like(a), y, max_trials=5),
                 minimise(Rosenbrock(), valley, max_trials=9),
             )
         )
-    for whole, blocks in zip(*results, strict=True):
-        torch.testing.assert_close(blocks.own, whole.own, atol=1e-9, rtol=0)
-        torch.testing.assert_close(blocks.shared, whole.shared, atol=1e-9, rtol=0)
-        torch.testing.assert_close(blocks.cost, whole.cost, atol=1e-9, rtol=1e-6)
-        assert blocks.trials == whole.trials
+    for whole, *others in zip(*results, strict=True):
+        for blocks in others:
+            torch.testing.assert_close(blocks.own, whole.own, atol=1e-9, rtol=0)
+            torch.testing.assert_close(blocks.shared, whole.shared, atol=1e-9, rtol=0)
+            torch.testing.assert_close(blocks.cost, whole.cost, atol=1e-9, rtol=1e-6)
+            assert blocks.trials == whole.trials
 
 
 def test_cost_never_rises_and_a_broken_frame_stays() -> None:
