@@ -30,7 +30,7 @@ class Extent:
 class JobResources:
     """Peak memory and time of a job, linear in frames and images.
 
-    Measured with ``python -m bench.stage_resources`` on 45 and 300 frames of six 1080p cameras and
+    Measured with ``python -m bench.stage_resources`` on 45 to 1,000 frames of six 1080p cameras and
     45 frames of three.
     """
 
@@ -117,21 +117,21 @@ STAGES: dict[str, Stage] = {
             name="scene",
             purpose="Refined extrinsics, ground plane and background.",
             reads=("frames", "detections"),
-            resources=JobResources(400, mb_per_image=0.09, seconds_per_image=0.03),
+            resources=JobResources(480, mb_per_image=0.035, seconds_per_image=0.03),
             output_bytes=2_000_000,
         ),
         Stage(
             name="person",
             purpose="The subject over views, and the triangulated keypoints.",
             reads=("frames", "detections", "scene"),
-            resources=JobResources(420, mb_per_image=0.05, seconds_per_image=0.02),
+            resources=JobResources(520, mb_per_image=0.045, seconds_per_image=0.02),
             output_bytes=7_000_000,
         ),
         Stage(
             name="object_track",
             purpose="The object's pose in every frame.",
             reads=("frames", "scene", "detections", "person"),
-            resources=JobResources(420, mb_per_image=0.47, seconds_per_image=0.06),
+            resources=JobResources(820, mb_per_image=0.025, seconds_per_image=0.06),
             output_bytes=200_000,
             estimates=True,
         ),
@@ -139,7 +139,7 @@ STAGES: dict[str, Stage] = {
             name="body_fit",
             purpose="SMPL-X parameters in every frame.",
             reads=("frames", "scene", "person"),
-            resources=JobResources(560, mb_per_image=0.4, seconds=15, seconds_per_image=0.06),
+            resources=JobResources(780, mb_per_image=0.05, seconds=15, seconds_per_image=0.06),
             output_bytes=1_100_000,
             estimates=True,
         ),

@@ -339,7 +339,7 @@ class Evidence:
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids)
-        contacts = []
+        problem.pairs, contacts = None, []  # those of the last search are not used
         for _, vertices, normals in self._bodies(problem.base):
             contacts += self._threads.map(
                 lambda posed: find_contacts(self._self_contact, *posed),

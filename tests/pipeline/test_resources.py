@@ -34,10 +34,11 @@ from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig
 SHORT, LONG, FEW = Extent(45, 6), Extent(1000, 6), Extent(1000, 2)
 # Largest resident set of the stage's process, MB: frames, cameras, measured.
 MEASURED = [
-    ("frames", 45, 6, 160), ("detections", 45, 6, 138), ("person", 300, 6, 494),
-    ("scene", 45, 3, 390), ("scene", 300, 6, 541),
-    ("object_track", 45, 3, 429), ("object_track", 300, 6, 1211),
-    ("body_fit", 45, 3, 562), ("body_fit", 300, 6, 1208),
+    ("frames", 45, 6, 160), ("detections", 45, 6, 138),
+    ("person", 300, 6, 494), ("person", 1000, 6, 788),
+    ("scene", 45, 3, 390), ("scene", 300, 6, 541), ("scene", 1000, 6, 668),
+    ("object_track", 45, 3, 429), ("object_track", 300, 6, 905), ("object_track", 1000, 6, 974),
+    ("body_fit", 45, 3, 562), ("body_fit", 300, 6, 907), ("body_fit", 1000, 6, 1102),
     ("joint", 45, 3, 767), ("joint", 300, 6, 1963), ("joint", 1000, 6, 4400),
     ("metrics", 45, 6, 986), ("summary", 300, 6, 383), ("page", 45, 6, 772),
     ("export", 45, 6, 648),
