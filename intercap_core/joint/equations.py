@@ -36,10 +36,18 @@ class BandedEquations:
             difference between frames is divided equally among them.
     """
 
-    def __init__(self, frames: int, threads: ThreadPool | None = None) -> None:
-        """Start with zeros. ``threads`` compute rows, a few frames each; None for one thread."""
-        self._threads = threads or ThreadPool()
-        self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
+    def __init__(
+        self, frames: int, threads: ThreadPool | None = None, *, energies_only: bool = False
+    ) -> None:
+        """Start with zeros.
+
+        Args:
+            frames: number T of frames.
+            threads: compute rows, a few frames each; None for one thread.
+            energies_only: compute no derivatives; all but ``energies`` stays 0.
+        """
+        self._threads, self._energies_only = threads or ThreadPool(), energies_only
+        self.bands = np.zeros((min(3, frames), 0 if energies_only else frames, ALL.stop, ALL.stop))
         self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
         self.energies: dict[str, np.ndarray] = {}
@@ -51,6 +59,11 @@ class BandedEquations:
         made.bands[...], made.damped = self.bands, self.damped.copy()
         made.gradient, made.energies = self.gradient.copy(), dict(self.energies)
         return made
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether ``bands`` were consumed by a solution, or never computed."""
+        return not self.bands.size
 
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), or None if the matrix is not positive definite.
@@ -88,8 +101,9 @@ class BandedEquations:
 
     def hold(self, columns: slice) -> None:
         """Give unknowns ``columns`` that no term constrains the step 0, by ones on the diagonal."""
-        own = self.bands[0][:, columns, columns]
-        own += np.eye(own.shape[-1])
+        if not self._energies_only:
+            own = self.bands[0][:, columns, columns]
+            own += np.eye(own.shape[-1])
 
     def add_blocks(
         self,
@@ -100,10 +114,12 @@ class BandedEquations:
         energy: np.ndarray,
     ) -> None:
         """Add J^T W J (T, m, m), J^T W r (T, m) and energy (T,) over ``columns`` of each frame."""
+        self.energies[term] = self.energies.get(term, 0.0) + energy
+        if self._energies_only:
+            return
         self.bands[0][:, columns, columns] += hessian
         self.damped[:, columns] += hessian.diagonal(axis1=1, axis2=2)
         self.gradient[:, columns] += gradient
-        self.energies[term] = self.energies.get(term, 0.0) + energy
 
     def add_rows(
         self,
@@ -141,7 +157,7 @@ class BandedEquations:
         if frames > ahead:
             shared = _over_stencil(np.full(ahead + 1, 1 / (ahead + 1)), energy)
         self.energies[term] = self.energies.get(term, 0.0) + shared
-        if frames <= ahead:
+        if frames <= ahead or self._energies_only:
             return
         forces = _over_stencil(stencil, weights[..., None] * residuals)
         # [d] (T - d, N): weight of the product of the Jacobians of frames t + d and t

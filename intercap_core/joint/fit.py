@@ -192,17 +192,16 @@ class _Rounds:
         if assembly.contact is not None:
             assembly.contact.take_contact(self.estimate.probability, self.estimate.labels)
         assembly.problem.refresh(self.state)
-        minimum = minimise(assembly.problem.equations, self.state, max_steps=max_steps)
+        minimum = minimise(assembly.problem, self.state, max_steps=max_steps)
         self.state = minimum.state
         self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
         self.energy_before = self.energy_before or minimum.energy_before
-        self.energy_after = minimum.equations.energy
+        self.energy_after = minimum.energies.energy
         self.last_step_m = _displacement(self._geometry, minimum.previous, minimum.state)
         self.last_decrease = minimum.decrease
         self.stalled &= minimum.stalled
-        log.info("%d steps, energy %.4g", self.steps, minimum.equations.total)
+        log.info("%d steps, energy %.4g", self.steps, minimum.energies.total)
         settled = minimum.converged or minimum.steps > 0  # not each step was refused
-        del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._contact_at(self.state)
         changed_m = _displacement(self._geometry, self._last, self.state)
         self._last = self.state

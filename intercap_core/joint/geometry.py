@@ -156,19 +156,22 @@ class PosedGeometry:
         return lin.along(along)[..., BODY].double().numpy()
 
     @cached_property
-    def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (T, 55, 3), and their derivative (T, 55, 3, 168) by the body as float32."""
-        g = self._geometry
-        vector = self._parameters.vector()
-        points = np.empty((len(vector), NUM_JOINTS, 3))
-        jacobian = np.empty((*points.shape, BODY.stop), np.float32)
+    def joints(self) -> np.ndarray:
+        """Joints (T, 55, 3)."""
+        with torch.no_grad():
+            body = self._geometry.model(self._parameters, vertex_ids=np.array([0]))
+        return body.joints.double().numpy()
+
+    @cached_property
+    def joints_by_body(self) -> np.ndarray:
+        """Derivative (T, 55, 3, 168) of the joints by the body's unknowns, float32."""
+        model, vector = self._geometry.model, self._parameters.vector()
+        jacobian = np.empty((len(vector), NUM_JOINTS, 3, BODY.stop), np.float32)
         for at in frame_chunks(len(vector)):
-            lin = g.model.linearise(
-                g.model.parameters(vector[at]), vertex_ids=np.zeros(0, np.int64), joints=True
-            )
-            points[at] = lin.joints.double().numpy()
+            parameters = model.parameters(vector[at])
+            lin = model.linearise(parameters, vertex_ids=np.zeros(0, np.int64), joints=True)
             jacobian[at] = lin.full()[..., BODY].numpy()
-        return points, jacobian
+        return jacobian
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:

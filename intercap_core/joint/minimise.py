@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from intercap_core.body.parameters import TRANSL
 from intercap_core.joint.equations import BandedEquations
+from intercap_core.joint.problem import JointProblem
 from intercap_core.joint.state import BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
 
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ class Minimum:
     state: State  # Final state
     previous: State  # State before the last accepted step
     decrease: float  # Decrease of the energy by the last accepted step, as a share of the energy
-    equations: BandedEquations  # Equations at the final state
+    energies: BandedEquations  # Energies at the final state
     energy_before: dict[str, float]  # Energy of each term at the start
     steps: int  # Number of accepted steps
     refused: int  # Number of refused steps
@@ -30,9 +30,7 @@ class Minimum:
     stalled: np.ndarray  # (T,) frames that no step moved, since each raised the energy there
 
 
-def minimise(
-    linearise: Callable[[State], BandedEquations], state: State, *, max_steps: int
-) -> Minimum:
+def minimise(problem: JointProblem, state: State, *, max_steps: int) -> Minimum:
     """Accept at most ``max_steps`` steps from ``state``, those that lower the energy.
 
     Steps are tried twice as often at most.
@@ -46,18 +44,20 @@ def minimise(
     stalling = 0.5  # damping with which a frame hardly moves, share of the diagonal
     accepted, refused, gained, converged = 0, 0, 0.0, False
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
-    here, previous, decrease = linearise(state), state, 0.0
+    previous, decrease = state, 0.0
+    here = problem.equations(state)
     before = here.energy
     for _ in range(2 * max_steps):
         if accepted == max_steps:
             break
+        if here.is_spent:
+            here = problem.equations(state)
         step = here.step(damping)
         if step is None:
             damping, refused = damping * 10.0, refused + 1
-            here = linearise(state)
             continue
         trial = state.moved(limited(step))
-        there = linearise(trial)
+        there = problem.energies(trial)
         bounds = damping.min(), damping.max()
         log.info("energy %.4g -> %.4g (damping %.0e to %.0e)", here.total, there.total, *bounds)
         if not there.total < here.total:
@@ -68,8 +68,6 @@ def minimise(
             if promised < 1e-3 * here.total and tried.max() < stalling:
                 converged = True
                 break
-            del there  # the equations of two states are never kept at once
-            here = linearise(state)
             continue
         gain = here.total - there.total
         gained += gain

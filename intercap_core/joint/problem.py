@@ -71,6 +71,13 @@ class JointProblem:
             term.add(state, equations)
         return equations
 
+    def energies(self, state: State) -> BandedEquations:
+        """Compute the energies of every term at ``state``, without derivatives."""
+        energies = BandedEquations(len(state), self.threads, energies_only=True)
+        for term in self.terms:
+            term.add(state, energies)
+        return energies
+
     def refresh(self, state: State) -> None:
         """Compute at ``state`` the quantities that the terms keep fixed during a round."""
         for term in self.terms:

@@ -173,7 +173,7 @@ class Scene:
 
     def minimise(self, max_steps: int = 8) -> Minimum:
         """Minimise all terms from the state."""
-        return minimise(self.problem.equations, self.state, max_steps=max_steps)
+        return minimise(self.problem, self.state, max_steps=max_steps)
 
     def distance(self, state: State, region: int | None = None) -> np.ndarray:
         """Distances (T, N) of the skin samples, or of a region's, to the object."""

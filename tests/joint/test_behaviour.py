@@ -110,7 +110,7 @@ def test_rim_between_the_vertices_of_the_skin_is_pushed_out(model):
         at = state
         for _ in range(3):
             problem.refresh(at)
-            at = minimise(problem.equations, at, max_steps=5).state
+            at = minimise(problem, at, max_steps=5).state
         depth[name] = _depth_of_blade(model, at)
     start = _depth_of_blade(model, state)
     assert (start > 0.003).all()
@@ -196,7 +196,7 @@ def test_fit_at_a_minimum_converges_at_once(model):
     state = bodies(model, 0.001)
     scene = Scene(model, state, hold=0.01, track=0.01, touching=(LEFT_HAND,))
     there = scene.minimise(max_steps=40).state
-    again = minimise(scene.problem.equations, there, max_steps=40)
+    again = minimise(scene.problem, there, max_steps=40)
     assert again.converged and again.steps <= 2
     assert np.abs(again.state.body - again.previous.body).max() < 1e-3 and again.decrease < 0.01
 

@@ -40,7 +40,7 @@ check(open_body(), SteadyHead)
 shaken = np.random.default_rng(0).normal(scale=0.01, size=(FRAMES, ALL.stop))
 state = bodies(open_body(), 0.5).moved(shaken)
 fit = Scene(open_body(), state, hold=0.1, track=0.1).minimise(max_steps=3)
-assert 0 < fit.equations.energy[SteadyHead.name] < fit.energy_before[SteadyHead.name]
+assert 0 < fit.energies.energy[SteadyHead.name] < fit.energy_before[SteadyHead.name]
 """
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.joint.equations import RATE, BandedEquations
+from intercap_core.joint.equations import RATE, BandedEquations, Rows
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
@@ -57,7 +57,7 @@ class _Drift(JointTerm):
         self,
         columns: slice,
         correction: np.ndarray,
-        jacobian: np.ndarray,
+        rows: Rows,
         weights: np.ndarray,
         equations: BandedEquations,
         *,
@@ -66,7 +66,7 @@ class _Drift(JointTerm):
         """Add the changes of ``correction`` (T, N, 3), metres.
 
         Args:
-            jacobian: (T, N, 3, m) derivative of the points by the unknowns ``columns``.
+            rows: derivatives of the points by the unknowns ``columns``.
             weights: (T - 1,) weight of each step, 1/m^2.
             stiff: leave these rows out of the damping.
         """
@@ -75,7 +75,7 @@ class _Drift(JointTerm):
         equations.add_rows(
             self.name,
             columns,
-            lambda at, some: jacobian[at, some],
+            rows,
             weight / 2.0,  # neighbouring points move as one: two are one measurement (tuned)
             change,
             stencil=RATE,
@@ -107,8 +107,14 @@ class BodyDrift(_Drift):
     def add(self, state: State, equations: BandedEquations) -> None:
         if len(state) < 3:
             return
-        joints, jacobian = self.geometry.at(state).joints
-        self._add_changes(BODY, joints - self._sequential, jacobian, self._weights, equations)
+        posed = self.geometry.at(state)
+        self._add_changes(
+            BODY,
+            posed.joints - self._sequential,
+            lambda at, some: posed.joints_by_body[at, some],
+            self._weights,
+            equations,
+        )
 
 
 class ObjectDrift(_Drift):
@@ -141,5 +147,9 @@ class ObjectDrift(_Drift):
             return
         points, jacobian = self.geometry.at(state).moments
         correction = points - self._sequential
-        self._add_changes(OBJECT, correction, jacobian, self._weights, equations)
-        self._add_changes(OBJECT, correction, jacobian, self._resting, equations, stiff=True)
+
+        def rows(at: slice, some: np.ndarray) -> np.ndarray:
+            return jacobian[at, some]
+
+        self._add_changes(OBJECT, correction, rows, self._weights, equations)
+        self._add_changes(OBJECT, correction, rows, self._resting, equations, stiff=True)

@@ -22,7 +22,7 @@ from torch import Tensor
 from intercap_core.body import lemo
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.lemo import MotionEncoder
-from intercap_core.joint.equations import ACCELERATION, BandedEquations
+from intercap_core.joint.equations import ACCELERATION, BandedEquations, Rows
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
@@ -60,14 +60,14 @@ class _Smoothness(JointTerm):
         self,
         columns: slice,
         points: np.ndarray,
-        jacobian: np.ndarray,
+        rows: Rows,
         factor: float,
         equations: BandedEquations,
     ) -> None:
         """Add the accelerations of points (T, N, 3), if there are three frames or more.
 
         Args:
-            jacobian: (T, N, 3, m) derivative of the points by the unknowns ``columns``.
+            rows: derivatives of the points by the unknowns ``columns``.
             factor: weight of the term.
         """
         if len(points) < 3:
@@ -78,7 +78,7 @@ class _Smoothness(JointTerm):
         equations.add_rows(
             self.name,
             columns,
-            lambda at, some: jacobian[at, some] * unit,
+            lambda at, some: rows(at, some) * unit,
             weight * factor,
             acceleration,
             energy * factor,
@@ -103,8 +103,10 @@ class BodyMotion(_Smoothness):
         return context.encoder is None
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        factor = self._settings.body_smoothness
-        self._add_accelerations(BODY, *self.geometry.at(state).joints, factor, equations)
+        posed, factor = self.geometry.at(state), self._settings.body_smoothness
+        self._add_accelerations(
+            BODY, posed.joints, lambda at, some: posed.joints_by_body[at, some], factor, equations
+        )
 
 
 class ObjectMotion(_Smoothness):
@@ -122,7 +124,9 @@ class ObjectMotion(_Smoothness):
     def add(self, state: State, equations: BandedEquations) -> None:
         points, jacobian = self.geometry.at(state).moments
         factor = self._settings.object_smoothness
-        self._add_accelerations(OBJECT, points, jacobian, factor, equations)
+        self._add_accelerations(
+            OBJECT, points, lambda at, some: jacobian[at, some], factor, equations
+        )
 
 
 class LearnedMotion(JointTerm):
@@ -177,7 +181,7 @@ class LearnedMotion(JointTerm):
 
     def refresh(self, state: State) -> None:
         """Set the encoder's axes to the heading of the body in the first frame."""
-        left, right = self.geometry.at(state).joints[0][0, _HIPS]
+        left, right = self.geometry.at(state).joints[0, _HIPS]
         across = right - left - self._up * (self._up @ (right - left))
         across /= np.linalg.norm(across)
         self._axes = np.stack([across, np.cross(self._up, across), self._up])
