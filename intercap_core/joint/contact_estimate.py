@@ -30,8 +30,10 @@ class ContactEstimate:
     issues: Sequence[AnnotationIssue] = ()  # Annotated intervals that the fit contradicts
 
     def change(self, other: ContactEstimate) -> float:
-        """Largest difference of a probability; 0 without an object."""
-        return float(np.nanmax(np.abs(self.probability - other.probability), initial=0.0))
+        """Largest difference of a probability in each frame, 95th percentile; 0 without an object.
+        """
+        change = np.abs(self.probability - other.probability).max(axis=1)
+        return float(np.nan_to_num(np.percentile(change, 95)))
 
     def doubtful_frames(self) -> list[tuple[np.ndarray, str]]:
         """Masks (T,) of frames that an annotation makes doubtful, each with its reason."""

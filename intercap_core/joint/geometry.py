@@ -12,6 +12,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.proximity import Proximity, SearchableSurface, proximity
@@ -103,9 +104,9 @@ class PosedGeometry:
 
         400 points of the object are compared with the whole posed body.
         """
-        g, state = self._geometry, self.state
-        mesh, faces = g.mesh, g.model.faces.numpy()
+        g, state, mesh = self._geometry, self.state, self._geometry.mesh
         points = sample_surface(mesh.vertices, mesh.faces, 400).of(mesh.vertices, mesh.faces)
+        skin = SurfaceTree(g.model.template.numpy(), g.model.faces.numpy())
         vector, depth = self._parameters.vector(), np.zeros(len(state))
         for at in frame_chunks(len(state)):
             with torch.no_grad():
@@ -119,8 +120,9 @@ class PosedGeometry:
                 near = placed[in_box.all(axis=1)]
                 if not len(near):
                     return 0.0
-                body = DistanceField(vertices, faces, threads=1)
-                return max(0.0, -float(body.signed_distance(near).min()))
+                # no point is a metre deep; distances outside do not matter
+                distance = skin.shaped(vertices).signed_distance(near, reach=0.01, deepest=1.0)
+                return max(0.0, -float(distance.min()))
 
             depth[at] = threads.map(deepest, list(enumerate(posed, at.start)))
         return depth
