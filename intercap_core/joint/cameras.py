@@ -48,15 +48,16 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class CameraEvidence:
-    """Gauss-Newton form of E_B or E_O by n unknowns x of each frame and D = 7 C of the cameras.
+    """Gauss-Newton form of E_B or E_O by n unknowns x of N frames and D = 7 C of the cameras.
 
     Symbols are those of the module's header.
     """
 
     columns: slice  # The n unknowns of a frame
-    matrix: np.ndarray  # (T, n, n) H_xx
-    gradient: np.ndarray  # (T, n) g_x
-    cross: np.ndarray  # (T, n, D) H_xd
+    frames: np.ndarray  # (N,) indices of the frames, increasing
+    matrix: np.ndarray  # (N, n, n) H_xx
+    gradient: np.ndarray  # (N, n) g_x
+    cross: np.ndarray  # (N, n, D) H_xd
     hessian: np.ndarray  # (D, D) H_dd, summed over frames
     pull: np.ndarray  # (D,) g_d, summed over frames
     share: float  # a, weight of a frame: 1 / number of frames with the same errors
@@ -67,7 +68,8 @@ class CameraStep:
     """A correction of the cameras."""
 
     step: np.ndarray  # (C, 7)
-    along: np.ndarray  # (T, 174) step of the frames' unknowns that follows from ``step``
+    along: np.ndarray  # (T, 174) step of the frames' unknowns that follows from ``step``,
+    # interpolated between the frames of the evidence
     covariance: np.ndarray  # (C, 7, C, 7) of the cameras' corrections after the step
 
     @property
@@ -127,8 +129,11 @@ class CameraFit:
             (np.abs(free) < 5.0 * self._sigma).all() and together < 5.0 and (size < 0.03).all()
         )
 
-    def solve(self, evidence: Sequence[CameraEvidence]) -> CameraStep:
-        """Return the step to the minimum of ``evidence`` and prior; fixed unknowns have step 0."""
+    def solve(self, evidence: Sequence[CameraEvidence], count: int) -> CameraStep:
+        """Return the step to the minimum of ``evidence`` and prior; fixed unknowns have step 0.
+
+        ``count`` is the number T of frames.
+        """
         free = self._free
         total, pull = self._information, self._information @ self._correction.ravel()[free]
         follows = []
@@ -148,9 +153,12 @@ class CameraFit:
         step[free] = -covariance @ pull
         stated = np.zeros((step.size, step.size))
         stated[np.ix_(free, free)] = covariance
-        along = np.zeros((len(evidence[0].matrix), ALL.stop))
+        along = np.zeros((count, ALL.stop))
         for form, follow in zip(evidence, follows, strict=True):
-            along[:, form.columns] -= follow @ step[free]
+            if len(form.frames):
+                own = (follow @ step[free]).T
+                between = [np.interp(np.arange(count), form.frames, column) for column in own]
+                along[:, form.columns] -= np.stack(between, axis=1)
         return CameraStep(
             step.reshape(self._correction.shape), along, stated.reshape(self.covariance.shape)
         )

@@ -214,10 +214,12 @@ class _Rounds:
         body, images = self._assembly.body, self._assembly.object_
         # the body weighs a twentieth (tuned): errors of keypoints and clothing depend on the view
         # and the pose, and so resemble errors of a camera
-        evidence = [body.camera_evidence(self.state, 0.05 * self._assembly.share)]
+        share = self._assembly.share
+        # frames with the same errors are represented by one of them
+        evidence = [body.camera_evidence(self.state, 0.05 * share, every=max(1, round(1 / share)))]
         if isinstance(images, ObjectImagesData):
             evidence.append(images.camera_evidence(self.state))
-        correction = cameras.solve(evidence)
+        correction = cameras.solve(evidence, len(self.state))
         if cameras.take(correction):
             log.info("cameras corrected by up to %.1f mm", 1e3 * correction.shift)
             self.state = self.state.moved(limited(correction.along))

@@ -100,6 +100,7 @@ def _camera_evidence(fitter: Fitter, problem: BodyProblem, stiffness: float) -> 
     frames, size = len(fitter.evidence.observations.times), FREEDOMS * CAMERAS
     evidence = CameraEvidence(
         BODY,
+        np.arange(frames),
         np.tile(stiffness * np.eye(BODY.stop), (frames, 1, 1)),
         np.zeros((frames, BODY.stop)),
         np.zeros((frames, BODY.stop, size)),
@@ -107,7 +108,7 @@ def _camera_evidence(fitter: Fitter, problem: BodyProblem, stiffness: float) -> 
         np.zeros(size),
         1.0,
     )
-    add_by_cameras(fitter.evidence, problem, np.ones(frames, bool), evidence)
+    add_by_cameras(fitter.evidence, problem, np.arange(frames), evidence)
     return evidence
 
 
@@ -124,7 +125,7 @@ def test_wrong_camera_is_corrected_at_known_bodies(fitter, source: str):
             problem.rows = None
         else:
             problem.views = None
-        cameras.take(cameras.solve([_camera_evidence(fitter, problem, stiffness=1e9)]))
+        cameras.take(cameras.solve([_camera_evidence(fitter, problem, stiffness=1e9)], len(evidence.observations.times)))
         evidence.take_cameras(cameras.now.rig, cameras.now.depth_bias)
     at_body = evidence.observations.joints[0, 0]
     true = np.linalg.inv(ring(CAMERAS)[WRONG].master_from_colour)
@@ -203,6 +204,7 @@ def test_prior_and_evidence_share_a_correction():
         own = np.concatenate([np.zeros(3), np.full(3, off)])
         return CameraEvidence(
             OBJECT,
+            np.arange(frames),
             np.tile((weight + known) * np.eye(6), (frames, 1, 1)),
             np.tile(weight * own, (frames, 1)),
             np.tile(weight * jacobian, (frames, 1, 1)),
@@ -211,13 +213,15 @@ def test_prior_and_evidence_share_a_correction():
             1.0,
         )
 
-    free = cameras.solve([evidence(known=0.0)])  # any camera explains a pose that is free
+    free = cameras.solve([evidence(known=0.0)], frames)  # any camera explains a pose that is free
     np.testing.assert_allclose(free.step, 0, atol=1e-9)
-    shared = cameras.solve([evidence(known=1e6 * weight)])
+    shared = cameras.solve([evidence(known=1e6 * weight)], frames)
     expected = off * frames * weight / (frames * weight + prior**-2)
     np.testing.assert_allclose(shared.step[0, SHIFT], expected, rtol=1e-3)
     np.testing.assert_allclose(shared.step[0, TURN], 0)
-    pulled = cameras.solve([replace(evidence(known=0.0), pull=frames * np.ones(FREEDOMS))])
+    pulled = cameras.solve(
+        [replace(evidence(known=0.0), pull=frames * np.ones(FREEDOMS))], frames
+    )
     along = np.tile(pulled.step[0, SHIFT], (5, 1))
     np.testing.assert_allclose(pulled.along[:, OBJECT][:, 3:], along)
 

@@ -321,7 +321,8 @@ def _camera_pulls(assembly: Assembly, state: State, covariance: np.ndarray) -> n
     variance, axes = np.linalg.eigh(covariance.reshape(count, count))
     root = axes * np.sqrt(variance.clip(min=0))
     pulls = np.zeros((len(state), ALL.stop, count))
-    pulls[:, BODY] = assembly.body.camera_evidence(state, 1.0).cross @ root
+    form = assembly.body.camera_evidence(state, 1.0)
+    pulls[form.frames, BODY] = form.cross @ root
     if isinstance(assembly.object_, ObjectImagesData):
         pulls[:, OBJECT] = assembly.object_.camera_evidence(state).cross @ root
     return pulls

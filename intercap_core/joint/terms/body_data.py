@@ -34,7 +34,7 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS, geman_mcclure_weight
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvidence, Cameras
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.state import BODY, State
+from intercap_core.joint.state import BODY, State, frame_chunks
 from intercap_core.joint.terms.term import Equation, JointTerm
 from intercap_core.schemas import BODY_FIT
 from intercap_core.sequence_inputs import SequencePaths
@@ -66,7 +66,6 @@ class BodyData(JointTerm):
     def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:
         self._fitter, self._problem = fitter, problem
         self._trusted = trusted[fitter.frames]
-        self._index = torch.arange(len(fitter.frames))
         self._interpolated: np.ndarray | None = None  # bodies at the first refresh
 
     @classmethod
@@ -144,20 +143,12 @@ class BodyData(JointTerm):
     def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,)."""
         assert self._interpolated is not None, "refresh comes first"
-        pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
-        shared = pose.new_zeros(0)  # no parameters are shared by all frames
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
         energy = np.zeros(len(state))
-        for chunk in self._index.split(64):  # to bound the memory
-            normal = self._problem.linearise(pose[chunk], shared, chunk)
-            places = chunk.numpy()  # a tensor with one element would index like a scalar
-            trusted = self._trusted[places]
-            at = self._fitter.frames[places][trusted]
-            hessian[at] = normal.hessian.numpy()[trusted]
-            gradient[at] = normal.gradient.numpy()[trusted]
-            energy[at] = normal.cost.double().numpy()[trusted]
-        frames = self._fitter.frames[self._trusted]
+        trusted = np.flatnonzero(self._trusted)
+        frames = self._fitter.frames[trusted]
+        hessian[frames], gradient[frames], energy[frames] = self._linearise(state, trusted)
         # a frame without a fit stays near its interpolated pose: 0.3 rad, 0.1 m (tuned)
         filled = np.setdiff1d(np.arange(len(state)), frames)
         precision = np.full(BODY.stop, 0.3**-2)
@@ -168,20 +159,50 @@ class BodyData(JointTerm):
         energy[filled] = 0.5 * (precision * offset**2).sum(axis=1)
         return hessian, gradient, energy
 
+    def _linearise(
+        self, state: State, places: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Matrix (N, 168, 168), gradient (N, 168), energy (N,) of frames ``places`` of the problem.
+        """
+        pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
+        shared = pose.new_zeros(0)  # no parameters are shared by all frames
+        hessian = np.empty((len(places), BODY.stop, BODY.stop))
+        gradient, energy = np.empty((len(places), BODY.stop)), np.empty(len(places))
+        for start in range(0, len(places), 64):  # to bound the memory
+            chunk = slice(start, start + 64)
+            part = torch.from_numpy(places[chunk])
+            normal = self._problem.linearise(pose[part], shared, part)
+            hessian[chunk], gradient[chunk] = normal.hessian.numpy(), normal.gradient.numpy()
+            energy[chunk] = normal.cost.double().numpy()
+        return hessian, gradient, energy
+
     def take_cameras(self, cameras: Cameras) -> None:
         """Use these cameras from the next :meth:`refresh` on."""
         self._fitter.evidence.take_cameras(cameras.rig, cameras.depth_bias)
 
-    def camera_evidence(self, state: State, share: float) -> CameraEvidence:
-        """Gauss-Newton form of E_B by body and cameras; ``share`` is a frame's weight."""
+    def camera_evidence(self, state: State, share: float, every: int = 1) -> CameraEvidence:
+        """Gauss-Newton form of E_B by body and cameras.
+
+        Args:
+            state: body of all frames.
+            share: weight of a frame.
+            every: use every n-th trusted frame in place of n frames.
+        """
         self._place(state)
         count = FREEDOMS * self.num_cameras
-        hessian, gradient, _ = self._equations(state)
-        cross = np.zeros((len(state), BODY.stop, count))
+        places = np.flatnonzero(self._trusted)[::every]
+        hessian, gradient, _ = self._linearise(state, places)
         seen = CameraEvidence(
-            BODY, hessian, gradient, cross, np.zeros((count, count)), np.zeros(count), share
+            BODY,
+            self._fitter.frames[places],
+            hessian,
+            gradient,
+            np.zeros((len(places), BODY.stop, count)),
+            np.zeros((count, count)),
+            np.zeros(count),
+            every * share,
         )
-        add_by_cameras(self._fitter.evidence, self._problem, self._trusted, seen)
+        add_by_cameras(self._fitter.evidence, self._problem, places, seen)
         return seen
 
     def residuals(self) -> BodyResiduals:
@@ -216,24 +237,27 @@ class BodyData(JointTerm):
 
 
 def add_by_cameras(
-    evidence: Evidence, problem: BodyProblem, trusted: np.ndarray, seen: CameraEvidence
+    evidence: Evidence, problem: BodyProblem, places: np.ndarray, seen: CameraEvidence
 ) -> None:
     """Add the derivatives of E_J and E_D by the cameras to ``seen``, at the problem's bodies.
 
-    ``trusted`` (N,) masks the frames of the problem that count. Symbols as in
+    ``places`` (N,) are the frames of the problem that ``seen`` refers to. Symbols as in
     :mod:`intercap_core.joint.cameras`.
     """
-    frames = np.flatnonzero(trusted)
-    for part in np.array_split(frames, max(1, -(-len(frames) // 32))):
-        if len(part):
-            _add_keypoints(evidence, problem, part, seen)
-            _add_clouds(evidence, problem, part, seen)
+    for at in frame_chunks(len(places)):
+        _add_keypoints(evidence, problem, places[at], seen, seen.cross[at])
+        _add_clouds(evidence, problem, places[at], seen, seen.cross[at])
 
 
 def _add_keypoints(
-    evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
+    evidence: Evidence,
+    problem: BodyProblem,
+    part: np.ndarray,
+    seen: CameraEvidence,
+    cross_of_part: np.ndarray,
 ) -> None:
-    """Add H_dd, g_d and H_xd of E_J in the frames ``part`` of the problem."""
+    """Add H_dd, g_d and, to ``cross_of_part``, H_xd of E_J in the frames ``part`` of the problem.
+    """
     views = problem.views
     if views is None:
         return
@@ -273,13 +297,17 @@ def _add_keypoints(
         own = slice(FREEDOMS * camera, FREEDOMS * (camera + 1))
         seen.hessian[own, own] += block
     seen.pull[:] += _array(gradient).ravel()
-    seen.cross[evidence.frames[part], BODY] += _array(cross).reshape(*cross.shape[:2], -1)
+    cross_of_part += _array(cross).reshape(cross_of_part.shape)
 
 
 def _add_clouds(
-    evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
+    evidence: Evidence,
+    problem: BodyProblem,
+    part: np.ndarray,
+    seen: CameraEvidence,
+    cross_of_part: np.ndarray,
 ) -> None:
-    """Add H_dd, g_d and H_xd of E_D in the frames ``part`` of the problem."""
+    """As :func:`_add_keypoints`, of E_D."""
     rows, by_view = problem.rows, evidence.by_view
     if rows is None or by_view is None:
         return
@@ -303,7 +331,7 @@ def _add_clouds(
     weighted = flat * own.weight[..., None]
     seen.hessian[:] += _array(torch.einsum("bsd,bse->de", weighted, flat))
     seen.pull[:] += _array(torch.einsum("bsd,bs->d", weighted, residual))
-    seen.cross[evidence.frames[part], BODY] += _array(by_body.transpose(1, 2) @ weighted)
+    cross_of_part += _array(by_body.transpose(1, 2) @ weighted)
 
 
 def _poses(evidence: Evidence) -> torch.Tensor:

@@ -352,7 +352,8 @@ class ObjectImagesData(JointTerm):
         # disagree. Errors that all views have in common affect the cameras' corrections, but not
         # this disagreement, so that the variance as stated counts here
         share = self._share * self._noise
-        return CameraEvidence(OBJECT, matrix, gradient, cross, hessian, pull, share)
+        frames = np.arange(len(offset))
+        return CameraEvidence(OBJECT, frames, matrix, gradient, cross, hessian, pull, share)
 
     def _offset(self, state: State) -> np.ndarray:
         return step_between(self._compared, rigid(state.rotation, state.translation))
