@@ -1,7 +1,7 @@
 """The joint fit: rounds of minimising equation 6 (:mod:`.problem`) over all frames at once.
 
-Each round starts with new contact probabilities and correspondences, and with corrected cameras
-if the setting ``refine_cameras`` is on.
+Each round corrects the cameras if the setting ``refine_cameras`` is on. It then minimises with new
+contact probabilities and correspondences.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    There are two to four rounds (``ROUND_STEPS``). The fit has converged if body and object moved
+    There are up to four rounds (``ROUND_STEPS``). The fit has converged if body and object moved
     by less than ``UNCHANGED_M`` since the last round and contact is unchanged.
     ``intervals`` are the annotated contacts; None to detect contact. If the sequential fits
     contradict the floor, it is not used, and every frame is flagged.
@@ -114,14 +114,12 @@ def fit(
         log.warning("%s: every frame is flagged; check the scene's ground", inputs.against_floor)
     cameras = inputs.cameras if (inputs.images or alone) and settings.refine_cameras else None
     rounds = _Rounds(inputs, assembly, partial(estimate_contact, inputs, settings, intervals))
-    for number, max_steps in enumerate(ROUND_STEPS, 1):
-        rounds.minimise(max_steps)
-        converged = rounds.convergence == Convergence.CONVERGED
-        # the second round is the first with corrected cameras
-        if number == len(ROUND_STEPS) or (number > 1 and converged):
-            break
+    for max_steps in ROUND_STEPS:
         if cameras is not None and not cameras.refused:
             rounds.correct_cameras(cameras)
+        rounds.minimise(max_steps)
+        if rounds.convergence == Convergence.CONVERGED:
+            break
     state, convergence = rounds.state, rounds.convergence
     stalled = rounds.stalled | (convergence == Convergence.STALLED)
     log.log(
@@ -176,6 +174,7 @@ class _Rounds:
         self.last_step_m = self.last_decrease = 0.0
         self._last = self.state  # at the end of the last round
         self._unchanged = False  # the last round hardly changed state and contact
+        self._is_new = True  # no term has been refreshed
 
     @property
     def convergence(self) -> Convergence:
@@ -212,11 +211,16 @@ class _Rounds:
     def correct_cameras(self, cameras: CameraFit) -> None:
         """Correct ``cameras`` by the residuals of the body and of images of the object."""
         body, images = self._assembly.body, self._assembly.object_
+        share = self._assembly.share
+        every = round(1 / share)  # one of the frames with the same errors represents them
+        if self._is_new:
+            body.refresh(self.state)
+            if isinstance(images, ObjectImagesData):
+                images.refresh(self.state, every)
+            self._is_new = False
         # the body weighs a twentieth (tuned): errors of keypoints and clothing depend on the view
         # and the pose, and so resemble errors of a camera
-        share = self._assembly.share
-        # frames with the same errors are represented by one of them
-        evidence = [body.camera_evidence(self.state, 0.05 * share, every=max(1, round(1 / share)))]
+        evidence = [body.camera_evidence(self.state, 0.05 * share, every)]
         if isinstance(images, ObjectImagesData):
             evidence.append(images.camera_evidence(self.state))
         correction = cameras.solve(evidence, len(self.state))

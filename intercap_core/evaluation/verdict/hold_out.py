@@ -324,7 +324,8 @@ def _camera_pulls(assembly: Assembly, state: State, covariance: np.ndarray) -> n
     form = assembly.body.camera_evidence(state, 1.0)
     pulls[form.frames, BODY] = form.cross @ root
     if isinstance(assembly.object_, ObjectImagesData):
-        pulls[:, OBJECT] = assembly.object_.camera_evidence(state).cross @ root
+        form = assembly.object_.camera_evidence(state)
+        pulls[form.frames, OBJECT] = form.cross @ root
     return pulls
 
 

@@ -144,6 +144,7 @@ class ObjectImagesData(JointTerm):
         self._evidence: dict[int, ImageEvidence] = {}  # of the last refresh, by frame
         self._agreeing: dict[int, ImageEvidence] = {}  # that does not contradict its pose
         self._noise = 1.0
+        self._every = 1  # tracked frames that a compared one stands for
 
     def take_cameras(self, cameras: Cameras) -> None:
         """Use these poses and depth biases from the next :meth:`refresh` on."""
@@ -156,9 +157,12 @@ class ObjectImagesData(JointTerm):
             for c, given in zip(self._cameras, self._geometry, strict=True)
         ]
 
-    def refresh(self, state: State) -> None:
-        """Compare the images with ``state``."""
-        poses = rigid(state.rotation, state.translation)
+    def refresh(self, state: State, every: int = 1) -> None:
+        """Compare the images with ``state``.
+
+        ``every`` compares every n-th tracked frame only, for a correction of the cameras.
+        """
+        poses, self._every = rigid(state.rotation, state.translation), every
         self._evidence = self._compare_images(poses)
         self._agreeing = {
             t: evidence for t, evidence in self._evidence.items() if not _contradicts(evidence)
@@ -182,7 +186,8 @@ class ObjectImagesData(JointTerm):
 
     def _compare_images(self, poses: np.ndarray) -> dict[int, ImageEvidence]:
         """Evidence of the tracked frames about these poses (T, 4, 4)."""
-        frames, twists = np.flatnonzero(self._tracked.seen).tolist(), self._motion(poses)
+        frames = np.flatnonzero(self._tracked.seen)[:: self._every].tolist()
+        twists = self._motion(poses)
         evidence = self._images.threads.map(
             lambda t: self._compare_frame(t, poses[t], twists[t]), frames
         )
@@ -336,23 +341,25 @@ class ObjectImagesData(JointTerm):
 
         The images are those of the last :meth:`refresh`.
         """
-        offset, size = self._offset(state), FREEDOMS * self._images.recording.count
+        frames = np.array(sorted(self._by_cameras), int)
+        offset, size = self._offset(state)[frames], FREEDOMS * self._images.recording.count
         columns = np.concatenate(
             [np.arange(FREEDOMS * c, FREEDOMS * (c + 1)) for c in self._cameras]
         )
         hessian, pull = np.zeros((size, size)), np.zeros(size)
         cross = np.zeros((len(offset), 6, size))
-        for t, form in self._by_cameras.items():
+        for at, t in enumerate(frames):
+            form = self._by_cameras[t]
             hessian[np.ix_(columns, columns)] += form.hessian
-            pull[columns] += form.gradient + form.cross.T @ offset[t]
-            cross[t][:, columns] = form.cross
-        gradient = np.einsum("tij,tj->ti", self._matrix, offset) + self._gradient
-        matrix = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
+            pull[columns] += form.gradient + form.cross.T @ offset[at]
+            cross[at][:, columns] = form.cross
+        own = self._matrix[frames]
+        gradient = np.einsum("tij,tj->ti", own, offset) + self._gradient[frames]
+        matrix = own + np.diag(UNKNOWN_SIGMA**-2)
         # ``_noise`` undoes the division of the matrices by it. It measures how much the views
         # disagree. Errors that all views have in common affect the cameras' corrections, but not
         # this disagreement, so that the variance as stated counts here
-        share = self._share * self._noise
-        frames = np.arange(len(offset))
+        share = self._share * self._noise * self._every
         return CameraEvidence(OBJECT, frames, matrix, gradient, cross, hessian, pull, share)
 
     def _offset(self, state: State) -> np.ndarray:
