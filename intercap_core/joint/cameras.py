@@ -16,7 +16,7 @@ covariance of the corrections.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,14 +129,14 @@ class CameraFit:
             (np.abs(free) < 5.0 * self._sigma).all() and together < 5.0 and (size < 0.03).all()
         )
 
-    def solve(self, evidence: Sequence[CameraEvidence], count: int) -> CameraStep:
+    def solve(self, evidence: Iterable[CameraEvidence], count: int) -> CameraStep:
         """Return the step to the minimum of ``evidence`` and prior; fixed unknowns have step 0.
 
-        ``count`` is the number T of frames.
+        ``evidence`` is that of successive windows of the ``count`` frames, each used once.
         """
         free = self._free
         total, pull = self._information, self._information @ self._correction.ravel()[free]
-        follows = []
+        follows: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
         for form in evidence:
             cross = form.cross[..., free]
             right = np.concatenate([cross, form.gradient[..., None]], axis=2)
@@ -147,18 +147,20 @@ class CameraFit:
             total = total + form.share * inside
             own = form.pull[free] - np.einsum("tid,ti->d", cross, solved[..., -1])
             pull = pull + form.share * own
-            follows.append(solved[..., :-1])
+            columns = form.columns.start, form.columns.stop
+            follows.setdefault(columns, []).append((form.frames, solved[..., :-1]))
         covariance = np.linalg.inv(total)
         step = np.zeros(self._correction.size)
         step[free] = -covariance @ pull
         stated = np.zeros((step.size, step.size))
         stated[np.ix_(free, free)] = covariance
         along = np.zeros((count, ALL.stop))
-        for form, follow in zip(evidence, follows, strict=True):
-            if len(form.frames):
-                own = (follow @ step[free]).T
-                between = [np.interp(np.arange(count), form.frames, column) for column in own]
-                along[:, form.columns] -= np.stack(between, axis=1)
+        for (first, last), parts in follows.items():
+            frames = np.concatenate([at for at, _ in parts])
+            moved = np.concatenate([follow @ step[free] for _, follow in parts])
+            if len(frames):
+                between = [np.interp(np.arange(count), frames, column) for column in moved.T]
+                along[:, first:last] = -np.stack(between, axis=1)
         return CameraStep(
             step.reshape(self._correction.shape), along, stated.reshape(self.covariance.shape)
         )

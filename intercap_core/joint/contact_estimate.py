@@ -17,52 +17,67 @@ from intercap_core.joint.contact.annotated import (
 )
 from intercap_core.joint.contact.detect import contact_probability, region_motion
 from intercap_core.joint.inputs import JointInputs
+from intercap_core.joint.sequential import SequentialFlags
 from intercap_core.joint.state import State
 from intercap_core.schemas import CONTACT_REGIONS
 
 
 @dataclass(frozen=True)
-class ContactEstimate:
-    """Contact of R regions in T frames."""
+class AnnotatedContact:
+    """Annotated contacts of T frames; see :func:`.annotated.annotation_evidence`."""
 
-    probability: np.ndarray  # (T, R); NaN without an object
+    intervals: Sequence[ContactInterval]  # Of the whole recording
+    evidence: np.ndarray  # (T, R) log odds
+    labels: np.ndarray  # (T, R) 1 touching, 0 free, -1 no label
+
+    @classmethod
+    def of(
+        cls, intervals: Sequence[ContactInterval], frames: int, uncertainty: int
+    ) -> AnnotatedContact:
+        """The annotation of a recording of ``frames`` frames; ``uncertainty`` of ends in frames."""
+        return cls(intervals, *annotation_evidence(intervals, CONTACT_REGIONS, frames, uncertainty))
+
+    def window(self, frames: slice) -> AnnotatedContact:
+        """The annotation of some frames."""
+        return AnnotatedContact(self.intervals, self.evidence[frames], self.labels[frames])
+
+    def issues(self, estimate: ContactEstimate, flags: SequentialFlags) -> list[AnnotationIssue]:
+        """Annotated intervals of the whole recording that ``estimate`` contradicts."""
+        unseen = flags.filled | flags.lost
+        evidence, detected, distance = self.evidence, estimate.detected, estimate.distance
+        return find_issues(self.intervals, CONTACT_REGIONS, evidence, detected, distance, unseen)
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """Contact of R regions in T frames. Without an object all but the labels are NaN."""
+
+    probability: np.ndarray  # (T, R)
     labels: np.ndarray  # (T, R) annotation: 1 touching, 0 free, -1 no label
-    issues: Sequence[AnnotationIssue] = ()  # Annotated intervals that the fit contradicts
+    detected: np.ndarray  # (T, R) probability by the geometry alone
+    distance: np.ndarray  # (T, R) of each region to the object, metres
 
     def change(self, other: ContactEstimate) -> float:
-        """Largest difference of a probability in each frame, 95th percentile; 0 without an object.
-        """
+        """Largest difference of a probability, 95th percentile over frames; 0 if unknown."""
         change = np.abs(self.probability - other.probability).max(axis=1)
         return float(np.nan_to_num(np.percentile(change, 95)))
 
-    def doubtful_frames(self) -> list[tuple[np.ndarray, str]]:
-        """Masks (T,) of frames that an annotation makes doubtful, each with its reason."""
-        frames = np.arange(len(self.probability))
-        return [
-            (np.isin(frames, list(issue.frames)), issue.text)
-            for issue in self.issues
-            if issue.distrusted
-        ]
-
 
 def estimate_contact(
-    inputs: JointInputs,
-    settings: JointSettings,
-    intervals: Sequence[ContactInterval] | None,
-    state: State,
+    inputs: JointInputs, settings: JointSettings, annotated: AnnotatedContact | None, state: State
 ) -> ContactEstimate:
     """Estimate contact at ``state``.
 
-    ``intervals`` are the annotated contacts. If they are None, contact is detected, or 0 everywhere
-    if the setting ``detect_contact`` is off.
+    If ``annotated`` is None, contact is detected, or 0 everywhere if the setting
+    ``detect_contact`` is off.
     """
     geometry, sequential = inputs.geometry, inputs.sequential
     shape = (len(state), len(CONTACT_REGIONS))
-    labels = np.full(shape, -1, np.int8)
+    labels, unknown = np.full(shape, -1, np.int8), np.full(shape, np.nan)
     if not geometry.has_object:
-        return ContactEstimate(np.full(shape, np.nan), labels)
-    if intervals is None and not settings.detect_contact:
-        return ContactEstimate(np.zeros(shape), labels)
+        return ContactEstimate(unknown, labels, unknown, unknown)
+    if annotated is None and not settings.detect_contact:
+        return ContactEstimate(np.zeros(shape), labels, unknown, unknown)
     posed, at_patch = geometry.at(state), geometry.skin.patch
     motion = region_motion(
         geometry.patches,
@@ -75,14 +90,8 @@ def estimate_contact(
         inputs.fps,
     )
     detected = contact_probability(motion, inputs.fps)
-    if intervals is None:
-        return ContactEstimate(detected, labels)
-    given, labels = annotation_evidence(
-        intervals, CONTACT_REGIONS, len(state), settings.annotation_uncertainty_frames
-    )
-    unseen = sequential.flags.filled | sequential.flags.lost
-    return ContactEstimate(
-        hold_exactly(contact_probability(motion, inputs.fps, given=given), given),
-        labels,
-        find_issues(intervals, CONTACT_REGIONS, given, detected, motion.distance, unseen),
-    )
+    if annotated is None:
+        return ContactEstimate(detected, labels, detected, motion.distance)
+    given = annotated.evidence
+    probability = hold_exactly(contact_probability(motion, inputs.fps, given=given), given)
+    return ContactEstimate(probability, annotated.labels, detected, motion.distance)

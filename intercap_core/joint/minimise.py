@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.parameters import TRANSL
-from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.problem import JointProblem
 from intercap_core.joint.state import BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
 
@@ -22,8 +21,8 @@ class Minimum:
     state: State  # Final state
     previous: State  # State before the last accepted step
     decrease: float  # Decrease of the energy by the last accepted step, as a share of the energy
-    energies: BandedEquations  # Energies at the final state
-    energy_before: dict[str, float]  # Energy of each term at the start
+    energies: dict[str, np.ndarray]  # (T,) of each term at the final state
+    energies_before: dict[str, np.ndarray]  # (T,) of each term at the start
     steps: int  # Number of accepted steps
     refused: int  # Number of refused steps
     converged: bool  # Whether the last step gained little, or would have
@@ -46,7 +45,7 @@ def minimise(problem: JointProblem, state: State, *, max_steps: int) -> Minimum:
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
     previous, decrease = state, 0.0
     here = problem.equations(state)
-    before = here.energy
+    before = here.energies
     for _ in range(2 * max_steps):
         if accepted == max_steps:
             break
@@ -79,7 +78,9 @@ def minimise(problem: JointProblem, state: State, *, max_steps: int) -> Minimum:
             converged = True
             break
     stalled = (damping >= stalling) & ~moved
-    return Minimum(state, previous, decrease, here, before, accepted, refused, converged, stalled)
+    return Minimum(
+        state, previous, decrease, here.energies, before, accepted, refused, converged, stalled
+    )
 
 
 def _risen(change: np.ndarray) -> np.ndarray:

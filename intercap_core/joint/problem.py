@@ -31,7 +31,7 @@ from intercap_core.joint.terms.stick import Stick
 from intercap_core.joint.terms.term import JointTerm, TermContext
 
 DATA_TERMS: tuple[type[JointTerm], ...] = (BodyData, ObjectImagesData, ObjectData, NoObject)
-"""Terms of the recording's data, which :func:`intercap_core.joint.fit.assemble` builds."""
+"""Terms of the recording's data, which :func:`intercap_core.joint.assembly.assemble` builds."""
 TERMS: tuple[type[JointTerm], ...] = (
     Contact,
     Stick,

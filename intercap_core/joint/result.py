@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -13,6 +14,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.flags import Flags
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.cameras import Cameras
+from intercap_core.joint.contact.annotated import AnnotationIssue
 from intercap_core.joint.contact_estimate import ContactEstimate
 from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
@@ -43,6 +45,7 @@ class JointFit:
 
     state: State  # Refined body and object
     contact: ContactEstimate  # Contact at this state
+    issues: Sequence[AnnotationIssue]  # Annotated intervals that the fit contradicts
     residuals: BodyResiduals  # Distances of the body to the images
     energy_before: dict[str, float]  # Energy by term at the start
     energy_after: dict[str, float]  # Energy by term at this state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,6 +48,12 @@ class State:
             rotation=self.rotation[frames],
             translation=self.translation[frames],
         )
+
+    def joined(self, windows: Sequence[State]) -> State:
+        """The states of consecutive windows as one, with the shape of this state."""
+        names = ("body", "expression", "rotation", "translation")
+        values = ([getattr(window, name) for window in windows] for name in names)
+        return replace(self, **dict(zip(names, map(np.concatenate, values), strict=True)))
 
     def without_object(self) -> State:
         """The same state with NaN poses of the object."""

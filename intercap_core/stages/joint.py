@@ -52,7 +52,7 @@ def run(
         return
     with open_inputs(paths, models, fit_settings) as inputs:
         fitted = fit(inputs, settings, contact)
-    for issue in fitted.contact.issues:
+    for issue in fitted.issues:
         first, last = issue.frames.start, max(issue.frames.start, issue.frames.stop - 1)
         sequence = inputs.attributes["sequence"]
         log.warning("sequence %s, frames %d to %d: %s", sequence, first, last, issue.text)

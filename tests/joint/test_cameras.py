@@ -125,7 +125,11 @@ def test_wrong_camera_is_corrected_at_known_bodies(fitter, source: str):
             problem.rows = None
         else:
             problem.views = None
-        cameras.take(cameras.solve([_camera_evidence(fitter, problem, stiffness=1e9)], len(evidence.observations.times)))
+        cameras.take(
+            cameras.solve(
+                [_camera_evidence(fitter, problem, stiffness=1e9)], len(evidence.observations.times)
+            )
+        )
         evidence.take_cameras(cameras.now.rig, cameras.now.depth_bias)
     at_body = evidence.observations.joints[0, 0]
     true = np.linalg.inv(ring(CAMERAS)[WRONG].master_from_colour)
@@ -219,9 +223,7 @@ def test_prior_and_evidence_share_a_correction():
     expected = off * frames * weight / (frames * weight + prior**-2)
     np.testing.assert_allclose(shared.step[0, SHIFT], expected, rtol=1e-3)
     np.testing.assert_allclose(shared.step[0, TURN], 0)
-    pulled = cameras.solve(
-        [replace(evidence(known=0.0), pull=frames * np.ones(FREEDOMS))], frames
-    )
+    pulled = cameras.solve([replace(evidence(known=0.0), pull=frames * np.ones(FREEDOMS))], frames)
     along = np.tile(pulled.step[0, SHIFT], (5, 1))
     np.testing.assert_allclose(pulled.along[:, OBJECT][:, 3:], along)
 

@@ -162,8 +162,7 @@ class BodyData(JointTerm):
     def _linearise(
         self, state: State, places: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Matrix (N, 168, 168), gradient (N, 168), energy (N,) of frames ``places`` of the problem.
-        """
+        """Matrix (N, 168, 168), gradient (N, 168) and energy (N,) in the frames ``places``."""
         pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
         shared = pose.new_zeros(0)  # no parameters are shared by all frames
         hessian = np.empty((len(places), BODY.stop, BODY.stop))
@@ -256,8 +255,7 @@ def _add_keypoints(
     seen: CameraEvidence,
     cross_of_part: np.ndarray,
 ) -> None:
-    """Add H_dd, g_d and, to ``cross_of_part``, H_xd of E_J in the frames ``part`` of the problem.
-    """
+    """Add H_dd, g_d and (to ``cross_of_part``) H_xd of E_J in the problem's frames ``part``."""
     views = problem.views
     if views is None:
         return
