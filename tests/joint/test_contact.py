@@ -144,7 +144,8 @@ def test_change_of_an_estimate_ignores_unknown_contact():
     shape = (4, len(CONTACT_REGIONS))
     labels = np.full(shape, -1, np.int8)
     unknown, half, none = (
-        ContactEstimate(np.full(shape, value), labels) for value in (np.nan, 0.5, 0.0)
+        ContactEstimate(values, labels, values, values)
+        for values in (np.full(shape, value) for value in (np.nan, 0.5, 0.0))
     )
     assert unknown.change(unknown) == 0
     assert half.change(none) == 0.5

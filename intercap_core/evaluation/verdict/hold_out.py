@@ -31,8 +31,8 @@ import torch
 
 from intercap_core.body.joints import BOTH_HANDS
 from intercap_core.config import JointSettings
-from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.assembly import Assembly, assemble
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
