@@ -66,7 +66,7 @@ def fit(
         annotated = AnnotatedContact.of(intervals, len(state), uncertainty)
     windows = split_frames(len(state))
 
-    @lru_cache(maxsize=1)  # the only window is opened once
+    @lru_cache(maxsize=int(len(windows) == 1))  # two windows would not fit into the memory
     def opened(start: int, stop: int) -> tuple[JointInputs, Assembly]:
         whole = stop - start == len(state)
         own = inputs if whole else inputs.window(slice(start, stop))
