@@ -20,7 +20,6 @@ either side, since only neighbouring frames are coupled: memory does not grow wi
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -48,6 +47,7 @@ from intercap_core.joint.state import (
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
+from intercap_core.joint.windows import split_frames
 from intercap_core.object_track.view_report import ViewReport
 
 
@@ -254,14 +254,11 @@ def hold_out(
     cameras = np.flatnonzero(inputs.cameras_of_person)
     if len(cameras) < 2:
         return None
-    count = len(result.state)
-    bounds = np.linspace(0, count, -(-count // window) + 1).round().astype(int)
-    windows = []
-    for first, last in itertools.pairwise(bounds.tolist()):
-        around = slice(max(0, first - MARGIN), min(count, last + MARGIN))
-        held = _hold_out(inputs.window(around), settings, result.window(around), cameras)
-        windows.append((held, slice(first - around.start, last - around.start)))
-    return HeldOut.joined(windows)
+    held = [
+        (_hold_out(inputs.window(at.used), settings, result.window(at.used), cameras), at.inner)
+        for at in split_frames(len(result.state), window, MARGIN)
+    ]
+    return HeldOut.joined(held)
 
 
 def _hold_out(

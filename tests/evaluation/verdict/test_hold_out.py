@@ -20,8 +20,8 @@ from intercap_core.evaluation.verdict.hold_out import (
     hold_out,
 )
 from intercap_core.evaluation.verdict.judge import reach_verdict
-from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.assembly import assemble
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import OBJECT_INSIDE, JointResult
