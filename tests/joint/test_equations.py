@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 import weakref
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -135,10 +136,23 @@ def _pulled_to_the_origin(broken: bool):
     return linearise
 
 
+class _Energy:
+    """A problem whose equations are those of a function."""
+
+    def __init__(self, linearise: Callable[[State], BandedEquations]) -> None:
+        self.equations = linearise
+
+    def energies(self, state: State) -> BandedEquations:
+        """The energies of the equations, without matrices."""
+        energies = BandedEquations(len(state), energies_only=True)
+        energies.energies = self.equations(state).energies
+        return energies
+
+
 def test_frame_that_cannot_descend_stalls_alone():
-    sound = minimise(_pulled_to_the_origin(broken=False), _state(), max_steps=12)
+    sound = minimise(_Energy(_pulled_to_the_origin(broken=False)), _state(), max_steps=12)
     assert not sound.stalled.any() and sound.refused == 0
-    minimum = minimise(_pulled_to_the_origin(broken=True), _state(), max_steps=12)
+    minimum = minimise(_Energy(_pulled_to_the_origin(broken=True)), _state(), max_steps=12)
     far = np.linalg.norm(minimum.state.translation, axis=1)
     elsewhere = np.abs(np.arange(FRAMES) - BROKEN) > 1
     assert minimum.steps > 0 and minimum.stalled[BROKEN] and not minimum.stalled[elsewhere].any()
@@ -154,8 +168,8 @@ def test_step_to_a_non_finite_energy_is_refused():
             equations.energies["place"][BROKEN] = np.nan
         return equations
 
-    minimum = minimise(breaks, _state(), max_steps=12)
-    assert np.isfinite(minimum.equations.total) and minimum.steps > 0
+    minimum = minimise(_Energy(breaks), _state(), max_steps=12)
+    assert np.isfinite(minimum.energies["place"]).all() and minimum.steps > 0
     assert np.linalg.norm(minimum.state.translation[0]) < 0.001
 
 
@@ -169,7 +183,7 @@ def test_matrices_of_two_states_are_never_kept():
         made.append(weakref.ref(equations))
         return equations
 
-    assert minimise(counted, _state(), max_steps=12).refused > 1
+    assert minimise(_Energy(counted), _state(), max_steps=12).refused > 1
     assert max(most) == 0
 
 
@@ -182,5 +196,5 @@ def test_short_recordings_can_stall(frames: int):
         equations.add_blocks("any", ALL, matrix, np.full((frames, ALL.stop), 0.1), energy)
         return equations
 
-    minimum = minimise(rises, _state(frames), max_steps=6)
+    minimum = minimise(_Energy(rises), _state(frames), max_steps=6)
     assert minimum.steps == 0 and minimum.refused > 0 and minimum.stalled.all()
