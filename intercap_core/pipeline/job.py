@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 
 from intercap_core import disk
 from intercap_core.errors import UserError
@@ -28,7 +27,6 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
-_META_SHAPES = "torch._meta_registrations"
 # Beginning of the last line of a log, and of its warnings. `intercap run` reads them.
 FINISHED = "finished in"
 FAILED = "failed:"
@@ -47,15 +45,6 @@ def set_threads(threads: int) -> None:
         os.environ[variable] = "1"
 
 
-def shorten_imports() -> None:
-    """Let the imports of a job take less time; call it before PyTorch is imported."""
-    # imports create many objects and no garbage: Python's default of 700 costs 0.4 s a job
-    gc.set_threshold(50_000)
-    # A third of PyTorch's import (0.3 s) registers shapes of results for tensors without data, for
-    # its compiler. An empty module replaces the one that does so.
-    sys.modules.setdefault(_META_SHAPES, ModuleType(_META_SHAPES))
-
-
 @contextmanager
 def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     """Run the block as one job that writes to ``log``.
@@ -65,7 +54,8 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     with the status that shells use.
     """
     set_threads(threads)
-    shorten_imports()
+    # imports create many objects and no garbage: Python's default of 700 costs 0.4 s a job
+    gc.set_threshold(50_000)
     log = Path(log)
     try:
         log.parent.mkdir(parents=True, exist_ok=True)

@@ -175,7 +175,7 @@ def test_depth_of_an_object_in_the_body(model):
     state = bodies(model, 0.05, 1)
     scene = Scene(model, state)
     assert scene.geometry.at(state).object_depth(ThreadPool()) == 0
-    chest = scene.geometry.at(state).joints[0][:, JOINT_INDEX["spine2"]]
+    chest = scene.geometry.at(state).joints[:, JOINT_INDEX["spine2"]]
     assert scene.geometry.at(with_object_at(state, chest)).object_depth(ThreadPool()) > 0.05
 
 
