@@ -107,7 +107,7 @@ def person_clouds(
 ) -> Iterator[PersonCloud | None]:
     """Yield the cloud of each frame, of about ``count`` points; None = no usable mask."""
     threads = ThreadPool(threads_of_job())
-    together = 64  # frames, limited by memory: a cloud and its depth images have 0.8 MB
+    together = 16  # frames, limited by memory: a cloud and its depth images have 0.8 MB
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
         for start in range(0, observations.num_frames, together):
