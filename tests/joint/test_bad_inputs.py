@@ -16,6 +16,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
+from intercap_core.annotation import ContactInterval
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.lemo import MotionEncoder
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
@@ -64,7 +65,7 @@ class HeldBall(fitted.Capture):
         """Put the floor ``rise`` metres above the true soles; y points down."""
         self.put("scene", ground_point=[0, self.vertices[..., 1].max() - rise, 2.4])
 
-    def run(self, **settings: object) -> Joint:
+    def run(self, contact: list[ContactInterval] | None = None, **settings: object) -> Joint:
         """Arrays of the joint stage's artefact."""
         output = self.paths["scene"].parent / "joint.h5"
         fixed = {"look_again": False, "refine_cameras": False}
@@ -77,6 +78,7 @@ class HeldBall(fitted.Capture):
                 ObjectTrackSettings(),
             ),
             output=output,
+            contact=contact,
         )
         with artefacts.read(output, JOINT) as artefact:
             arrays = {key: artefact[key] for key in artefact.keys("")}
