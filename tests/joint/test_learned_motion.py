@@ -98,7 +98,7 @@ def test_energy_does_not_depend_on_place_and_heading(context, term):
     term.refresh(state)
     energy = _equations(term, state).total
     turn = Rotation.from_rotvec(1.2 * UP)
-    body, pelvis = state.body.copy(), context.geometry.at(state).joints[0][:, 0]
+    body, pelvis = state.body.copy(), context.geometry.at(state).joints[:, 0]
     body[:, :3] = (turn * Rotation.from_rotvec(state.body[:, :3])).as_rotvec()
     fixed = pelvis - state.body[:, TRANSL]  # turns about the pelvis leave it where it is
     body[:, TRANSL] = turn.apply(pelvis) - fixed + [3.0, 0.0, -2.0]
