@@ -1,13 +1,18 @@
-"""Seconds and peak memory of every stage at several sequence lengths.
+"""Seconds and peak memory of every stage at several sequence lengths and numbers of cameras.
 
     python -m bench.stage_resources config/bench/config.yaml --frames 45 300 1000
+    python -m bench.stage_resources config/bench/config.yaml --cameras 2 3 6 12
 
 The first sequence of the project, which must be computed, is extended to each length. Each stage
-runs in a separate process and prints one row: stage, frames, CPU seconds and peak memory. From the
-two greatest lengths follow the law of each stage, linear in the frames, and
-``scale.long_recording_mb``: the largest peak of a recording of 10 minutes at 30 frames per second
-by these laws. The resource needs of the stages (``Stage.resources`` in
-``intercap_core.stage_list``) are derived from it.
+runs in a separate process and prints one row: stage, cameras, frames, CPU seconds and peak memory.
+From the two greatest lengths follow the law of each stage, linear in the frames and never
+decreasing, and ``scale.long_recording_mb``: the largest peak of a recording of 10 minutes at 30
+frames per second by these laws. The largest measured peak is its lower bound. The resource needs of
+the stages (``Stage.resources`` in ``intercap_core.stage_list``) are derived from it.
+
+With ``--cameras``, the studio makes the first recording with each number of cameras, in
+``results/<dataset>/cameras_<number>``. All stages up to the last of ``--stages`` are measured on it
+in order, at its own length.
 
 A recording is repeated forward and backward, so that motion is continuous: every dataset with a
 frame axis in the stage's inputs is extended. Images are not copied; the new frames refer to the
@@ -23,6 +28,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,8 +36,9 @@ import numpy as np
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact, Writer
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.pipeline.step import run_step
+from intercap_core.pipeline.step import run_step, run_studio
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
@@ -149,21 +156,34 @@ def _runs(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(lengths.sum())
 
 
-def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) -> float:
-    """Peak resident memory of the joint stage on ``count`` frames, in a separate process.
+def load_rig(settings: Path, cameras: int) -> Project:
+    """The project; if ``cameras`` > 0, with as many virtual cameras and a folder of its own.
 
-    Raises UserError if the stage fails.
+    Raises UserError if the recordings are real.
     """
-    with tempfile.TemporaryDirectory(dir=project.results) as folder:
-        for stage in STAGES["joint"].reads:
-            source = project.artefact(sequence, stage)
-            lengthen(source, stage, Path(folder) / f"{stage}.h5", count)
-        row = run_apart(settings, "joint", Path(folder), count)
-    if row is None:
-        raise UserError(
-            f"{sequence}: the joint stage failed on {count} frames; see the lines above"
-        )
-    return row.mb
+    project = load_project(settings)
+    if not cameras:
+        return project
+    if project.config.studio is None:
+        raise UserError(f"{settings}: has no studio, so --cameras cannot be chosen; leave it out")
+    dataset = f"{project.config.dataset}/cameras_{cameras}"
+    studio = project.config.studio.model_copy(update={"cameras": cameras})
+    config = project.config.model_copy(update={"dataset": dataset, "studio": studio})
+    rig = replace(project, config=config)
+    rows = {name: _moved(row, project.results, rig.results) for name, row in rig.sequences.items()}
+    return replace(rig, sequences=rows)
+
+
+def _moved(row: SequenceEntry, source: Path, target: Path) -> SequenceEntry:
+    """The row with its paths below ``source`` replaced by those below ``target``."""
+    paths = {name: path for name, path in row if isinstance(path, Path)}
+    return row.model_copy(
+        update={
+            name: target / path.relative_to(source)
+            for name, path in paths.items()
+            if path.is_relative_to(source)
+        }
+    )
 
 
 def peak_mb() -> float:
@@ -177,6 +197,7 @@ class Row(NamedTuple):
     """Figures of one stage."""
 
     stage: str
+    cameras: int
     frames: int
     seconds: float
     """Seconds of CPU."""
@@ -184,83 +205,136 @@ class Row(NamedTuple):
     """Peak resident memory, megabytes."""
 
 
-def run_apart(settings: Path, stage: str, folder: Path, frames: int) -> Row | None:
-    """Row of a stage that runs in a separate process on the artefacts in ``folder``."""
+def run_apart(settings: Path, stage: str, *options: str) -> Row | None:
+    """Run a stage in a separate process with ``options`` of this command; print and return its row.
+
+    Returns None if it failed.
+    """
     done = subprocess.run(
-        [sys.executable, "-m", "bench.stage_resources", str(settings), "--stage", stage,
-         "--folder", str(folder), "--frames", str(frames)],
+        [sys.executable, "-m", "bench.stage_resources", str(settings), "--stage", stage, *options],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     if done.returncode:
+        print(f"{stage} failed", flush=True)
         return None
-    seconds, mb = done.stdout.splitlines()[-1].split()
-    return Row(stage, frames, float(seconds), float(mb))
+    cameras, frames, seconds, mb = done.stdout.splitlines()[-1].split()
+    row = Row(stage, int(cameras), int(frames), float(seconds), float(mb))
+    print(
+        f"{stage}\t{cameras} cameras\t{frames} frames\t{row.seconds:.1f} s\t{row.mb:.0f} MB",
+        flush=True,
+    )
+    return row
 
 
 def measure(settings: Path, frames: int, stages: Sequence[str]) -> list[Row]:
     """Print and return the rows of ``stages``, which read artefacts, on ``frames`` frames."""
     project = load_project(settings)
     sequence = next(iter(project.sequences))
-    rows = []
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         made = {name for stage in stages for name in STAGES[stage].reads}
         for stage in (name for name in STAGES if name in made):
             source = project.artefact(sequence, stage)
             lengthen(source, stage, Path(folder) / f"{stage}.h5", frames)
-        for stage in stages:
-            row = run_apart(settings, stage, Path(folder), frames)
-            if row is None:
-                print(f"{stage} failed", flush=True)
-                continue
-            print(f"{stage}\t{frames}\t{row.seconds:.1f} s\t{row.mb:.0f} MB", flush=True)
-            rows.append(row)
-    return rows
+        rows = [run_apart(settings, stage, "--folder", folder) for stage in stages]
+    return [row for row in rows if row]
+
+
+def measure_rig(settings: Path, cameras: int, stages: Sequence[str]) -> list[Row]:
+    """Make the recording with ``cameras`` cameras; print and return the rows of its stages.
+
+    All stages up to the last of ``stages`` are measured.
+    """
+    project = load_rig(settings, cameras)
+    run_studio(project, next(iter(project.sequences)))
+    order = list(STAGES)
+    order = order[: 1 + max(order.index(stage) for stage in stages)]
+    rows = [run_apart(settings, stage, "--cameras", str(cameras)) for stage in order]
+    return [row for row in rows if row]
+
+
+class Law(NamedTuple):
+    """Cost of a stage, linear in the frames."""
+
+    at_zero: float
+    per_frame: float
+
+    @classmethod
+    def fit(cls, frames: Sequence[int], costs: Sequence[float]) -> Law:
+        """The line through the two greatest lengths; the largest cost if that line decreases."""
+        (before, low), (last, high) = sorted(zip(frames, costs, strict=True))[-2:]
+        slope = (high - low) / (last - before)
+        return cls(high - slope * last, slope) if slope > 0 else cls(max(costs), 0.0)
+
+    def at(self, frames: int) -> float:
+        """Cost of ``frames`` frames."""
+        return self.at_zero + self.per_frame * frames
 
 
 def print_laws(rows: Sequence[Row]) -> None:
-    """Print the law of each stage by its two greatest lengths, and what follows for a long one."""
-    largest: dict[str, float] = {}
-    for stage in dict.fromkeys(row.stage for row in rows):
-        own = sorted((row for row in rows if row.stage == stage), key=lambda row: row.frames)[-2:]
+    """Print the law of each stage and rig, and what follows for a long recording."""
+    long: dict[str, tuple[float, float, int]] = {}  # extrapolated MB, measured MB, at frames
+    for stage, cameras in dict.fromkeys((row.stage, row.cameras) for row in rows):
+        own = [row for row in rows if (row.stage, row.cameras) == (stage, cameras)]
+        frames = [row.frames for row in own]
         if len(own) < 2:
             continue
-        low, high = own
-        count = high.frames - low.frames
-        per_frame, each = (high.mb - low.mb) / count, (high.seconds - low.seconds) / count
+        memory = Law.fit(frames, [row.mb for row in own])
+        time_ = Law.fit(frames, [row.seconds for row in own])
+        name = f"{stage}, {cameras} cameras"
         print(
-            f"{stage}: {high.mb - per_frame * high.frames:.0f} MB + {per_frame:.3f} MB a frame, "
-            f"{high.seconds - each * high.frames:.0f} s + {each:.3f} s a frame"
+            f"{name}: {memory.at_zero:.0f} MB + {memory.per_frame:.3f} MB a frame, "
+            f"{time_.at_zero:.0f} s + {time_.per_frame:.3f} s a frame"
         )
-        largest[stage] = high.mb + per_frame * (LONG_RECORDING - high.frames)
-    if largest:
-        stage = max(largest, key=largest.__getitem__)
+        most = max(own, key=lambda row: row.mb)
+        long[name] = max(memory.at(LONG_RECORDING), most.mb), most.mb, most.frames
+    if long:
+        name = max(long, key=lambda name: long[name][0])
+        extrapolated, measured, frames_ = long[name]
         print(
-            f"scale.long_recording_mb {largest[stage]:.0f} ({stage}; {LONG_RECORDING} frames, "
-            f"extrapolated from {max(row.frames for row in rows)})"
+            f"scale.long_recording_mb {extrapolated:.0f} ({name}; {LONG_RECORDING} frames, "
+            f"extrapolated; measured and lower bound: {measured:.0f} at {frames_} frames)"
         )
 
 
-def run(settings: Path, stage: str, folder: Path, frames: int) -> None:
-    """Run one stage on a folder's artefacts and print CPU seconds and peak megabytes."""
-    project = load_project(settings)
-    inputs = {name: folder / f"{name}.h5" for name in STAGES[stage].reads}
-    output = folder / f"{stage}.new"
-    run_step(stage, project, next(iter(project.sequences)), inputs=inputs, output=output)
-    print(f"{time.process_time():.2f} {peak_mb():.1f}", flush=True)
+def run(settings: Path, stage: str, folder: Path | None, cameras: int) -> None:
+    """Run one stage on the artefacts in ``folder`` (None = those of the project with ``cameras``).
+
+    Prints cameras, frames, CPU seconds and peak megabytes.
+    """
+    project = load_rig(settings, cameras)
+    sequence = next(iter(project.sequences))
+    if folder is None:
+        run_step(stage, project, sequence)
+        frames = project.artefact(sequence, "frames")
+    else:
+        row = project.sequences[sequence].model_copy(update={"truth": None})
+        project = replace(project, sequences={sequence: row})
+        inputs = {name: folder / f"{name}.h5" for name in STAGES[stage].reads}
+        run_step(stage, project, sequence, inputs=inputs, output=folder / f"{stage}.new")
+        frames = inputs["frames"]
+    seconds, mb = time.process_time(), peak_mb()
+    with artefacts.read(frames, schemas.FRAMES) as read:
+        count, present = read["colour_index"].shape
+    print(f"{present} {count} {seconds:.2f} {mb:.1f}", flush=True)
 
 
 def _main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
-    parser.add_argument("--frames", type=int, nargs="+", default=[45, 300])
+    lengths = parser.add_mutually_exclusive_group()
+    lengths.add_argument("--frames", type=int, nargs="+", default=[45, 300])
+    lengths.add_argument("--cameras", type=int, nargs="+")
     parser.add_argument("--stages", nargs="+", choices=FROM_ARTEFACTS, default=FROM_ARTEFACTS)
     parser.add_argument("--stage", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.stage:
-        run(given.settings, given.stage, given.folder, given.frames[0])
-        return
-    print_laws([row for n in given.frames for row in measure(given.settings, n, given.stages)])
+        run(given.settings, given.stage, given.folder, given.cameras[0] if given.cameras else 0)
+    elif given.cameras:
+        for cameras in given.cameras:
+            measure_rig(given.settings, cameras, given.stages)
+    else:
+        print_laws([row for n in given.frames for row in measure(given.settings, n, given.stages)])
 
 
 if __name__ == "__main__":
