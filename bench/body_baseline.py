@@ -105,7 +105,7 @@ def fit_by_lbfgs(
     rounds: int = ROUNDS,
 ) -> FrameFit:
     """Fit frame ``t`` from the body ``start`` (P,) through ``stages`` of at most ``rounds``."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     free = Free(model)
     x = free.of(start).requires_grad_(True)
     energy = Energy(model, seen, t, cloud)
@@ -120,7 +120,7 @@ def fit_by_lbfgs(
             optimiser.zero_grad()
             loss = energy(free.full(x))
             loss.backward()
-            now = time.perf_counter() - begin
+            now = time.process_time() - begin
             path.append((x.detach().clone(), loss.item(), number, now))
             return loss
 

@@ -66,9 +66,9 @@ class Run:
 
 def fit_clip(clip: BodyClip) -> Run:
     """Fit all frames of the clip as the stage does."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     fit = Fitter(clip.model, clip.seen, clip.clouds, clip.settings).run()
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     if len(fit.frames) != len(clip):
         raise UserError(f"{clip.seen.sequence}: frames without a person cannot be compared")
     return Run(seconds / len(clip), clip.errors(fit.vectors, fit.frames))
@@ -315,11 +315,11 @@ def _milliseconds(posing: Posing, x: Tensor) -> float:
     seconds = []
     for _ in range(1 + FORWARD_REPEATS):  # the first warms up
         x.grad = None
-        begin = time.perf_counter()
+        begin = time.process_time()
         vertices = posing(x)
         if x.requires_grad:
             vertices.sum().backward()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     return 1e3 * statistics.median(seconds[1:])
 
 

@@ -259,7 +259,7 @@ class Refined:
 
 def refine(energy: Energy, frames: int, steps: int = STEPS) -> Refined:
     """Take at most ``steps`` L-BFGS steps from the sequential fits of ``frames``."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     x = torch.zeros((frames, OBJECT_SHIFT.stop), requires_grad=True)
     optimiser = _lbfgs(x)
     states = [energy.state(x)]
@@ -280,7 +280,7 @@ def refine(energy: Energy, frames: int, steps: int = STEPS) -> Refined:
 
         first = optimiser.step(closure).item()
         if not rows:
-            rows.append((time.perf_counter() - begin, first, 0))
+            rows.append((time.process_time() - begin, first, 0))
         taken = optimiser.state[x]["n_iter"] - taken
         with torch.no_grad():
             last = energy(x).item()
@@ -288,7 +288,7 @@ def refine(energy: Energy, frames: int, steps: int = STEPS) -> Refined:
             raise FloatingPointError(f"the baseline's energy is {last} after {done} steps")
         done += max(taken, 1)
         states.append(energy.state(x))
-        rows.append((time.perf_counter() - begin, last, done))
+        rows.append((time.process_time() - begin, last, done))
         if abs(first - last) <= TOLERANCE * max(first, last, 1.0):
             if taken >= ROUND or before == 0:
                 break

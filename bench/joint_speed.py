@@ -1,4 +1,4 @@
-"""Compare the joint stage with the paper's recipe: seconds per frame, memory and errors.
+"""Compare the joint stage with the paper's recipe: CPU seconds per frame and errors.
 
     python -m bench.joint_speed [config/bench/config.yaml] [--output results/bench.json]
 
@@ -6,8 +6,7 @@ Needs the artefacts of ``intercap dev bench``. Both methods refine the whole fir
 same sequential fits, keypoints, clouds, crops and cameras, with the same number of threads. The
 stage is timed with reading and writing of files, without the start of its process. The recipe
 starts from inputs in memory and is timed over ``--steps`` steps, and until the truth says that it
-is as accurate as ours or at its best. The stage's peak memory is measured on the recording extended
-to 300 and 1,000 frames. Adds figures with keys ``joint.<measure>`` to the output.
+is as accurate as ours or at its best. Adds figures with keys ``joint.<measure>`` to the output.
 """
 
 from __future__ import annotations
@@ -26,22 +25,19 @@ import torch
 from bench.clips import JointClip, JointErrors, read_state
 from bench.command import add_figures, from_command_line
 from bench.joint_baseline import STEPS, Energy, refine
-from bench.stage_resources import peak_memory_mb
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
-
-LONG = (300, 1000)  # frames
 
 
 def run_stage(project: Project, sequence: str) -> tuple[float, State]:
     """Run the whole stage; returns its seconds and its result."""
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         output = Path(folder) / "joint.h5"
-        begin = time.perf_counter()
+        begin = time.process_time()
         run_step("joint", project, sequence, output=output)
-        return time.perf_counter() - begin, read_state(output)
+        return time.process_time() - begin, read_state(output)
 
 
 def measure(settings: Path, output: Path, steps: int) -> None:
@@ -54,24 +50,17 @@ def measure(settings: Path, output: Path, steps: int) -> None:
     energy = Energy(clip)
     refine(energy, len(clip), 1)
 
-    first, state = run_stage(project, sequence)
+    seconds, state = run_stage(project, sequence)
     recipe = refine(energy, len(clip), steps)
-    again, _ = run_stage(project, sequence)  # before and after, to average out other load
-    seconds = (first + again) / 2
     found = [clip.errors(one) for one in recipe.states]
     start, end, reached = clip.errors(clip.start), found[-1], clip.errors(state)
     # state 0 is the common start
     means = np.array([one.mean for one in found[1:]])
     at, is_as_good = first_as_good(means, reached.mean, near_best=1.0)
     at += 1
-    memory = {
-        f"peak_memory_{count}_mb": peak_memory_mb(settings, project, sequence, count)
-        for count in LONG
-    }
     figures = {
         **_known(output, "joint.peak_memory_mb"),
         "seconds_per_frame": seconds / len(clip),
-        **memory,
         "baseline_seconds_per_frame": recipe.seconds[-1] / len(clip),
         "baseline_until_seconds_per_frame": recipe.seconds[at] / len(clip),
         "baseline_steps": recipe.steps[-1],
@@ -127,8 +116,7 @@ def _print(
     console.print(
         f"{figures['seconds_per_frame']:.3f} s a frame; speed-up {figures['speedup_recipe']:.0f} "
         f"over the recipe, {figures['speedup_accuracy']:.0f} to "
-        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy; peak "
-        + ", ".join(f"{figures[f'peak_memory_{n}_mb']:.0f} MB at {n} frames" for n in LONG),
+        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy",
         highlight=False,
     )
     if figures["sequential_reaches_our_accuracy"]:

@@ -75,7 +75,7 @@ def fit_by_adam(
 
     The rotation vector is relative to the frame's start, far from its singularity at 180 degrees.
     """
-    begin = time.perf_counter()
+    begin = time.process_time()
     crops = Crops.cut(mesh, views, pose, min_overlap, labels)
     if crops is None:
         return FrameFit(pose[None], np.zeros(1))
@@ -95,7 +95,7 @@ def fit_by_adam(
         images(rotation_from_axis_angle(turn[None]) @ start, place[None]).backward()
         adam.step()
         path.append(np.append(turn.detach().numpy(), place.detach().numpy()))
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     poses = np.tile(np.eye(4), (len(path), 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(np.array(path)[:, :3]).as_matrix() @ pose[:3, :3]
     poses[:, :3, 3] = np.array(path)[:, 3:]

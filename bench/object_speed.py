@@ -12,14 +12,12 @@ degrees) and the same number of threads. Adds figures with keys ``object.<measur
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # as one job of the stage has
 from bench.timing import AS_GOOD, NEAR_BEST, THREADS  # before the numerical libraries
 
 # isort: split
@@ -115,9 +113,9 @@ def run_tracker(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEA
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
         tracker = clip.tracker()
-        begin = time.perf_counter()
+        begin = time.process_time()
         track = tracker.run([] if start is None else [_given(start)])
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
         poses = np.array([frame.fit.pose for frame in track.frames])
     return Run.of(clip, poses, statistics.median(seconds))
 
@@ -127,7 +125,7 @@ def run_single_pass(clip: ObjectClip, start: np.ndarray) -> Run:
     seconds, poses = [], np.zeros(0)
     for _ in range(REPEATS):
         observer = clip.observer()
-        begin = time.perf_counter()
+        begin = time.process_time()
         fit = observer.fit(0, start, MotionPrior(start), rounds=FIT_ROUNDS, scale=1.0)
         found = [fit.pose, fit.pose]  # before the first frame it rested
         for t in range(1, len(clip)):
@@ -137,20 +135,20 @@ def run_single_pass(clip: ObjectClip, start: np.ndarray) -> Run:
                 observer.fit(t, guess, predict_prior(before, now, guess, clip.step_s)).pose
             )
         poses = np.array(found[1:])
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     return Run.of(clip, poses, statistics.median(seconds))
 
 
 def run_recipe(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
     """Run the baseline; each frame starts at the pose that the tracker would extrapolate."""
-    begin, before, now = time.perf_counter(), start, start
+    begin, before, now = time.process_time(), start, start
     poses: list[np.ndarray] = []
     for views in clip.views:
         guess = extrapolate(before, now)
         fit = fit_frame(clip, views, guess, recipe, recipe.steps if poses else recipe.first_steps)
         before, now = (now if poses else fit.poses[-1]), fit.poses[-1]
         poses.append(now)
-    return Run.of(clip, np.array(poses), time.perf_counter() - begin)
+    return Run.of(clip, np.array(poses), time.process_time() - begin)
 
 
 def fit_frame(

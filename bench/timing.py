@@ -1,4 +1,8 @@
-"""Shared by the comparisons of our stages with the paper's recipes: threads and tolerances."""
+"""Shared by the comparisons of our stages with the paper's recipes: threads and tolerances.
+
+All times of the comparisons are CPU seconds on one thread, so that other load of the machine does
+not change them.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 
 from intercap_core.geometry.solve.thread_pool import VARIABLE
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the numerical libraries start
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when the numerical libraries start
 THREADS = int(os.environ["OMP_NUM_THREADS"])
 os.environ[VARIABLE] = str(THREADS)
 AS_GOOD = 1.02  # factor of our error below which a result counts as equally accurate
