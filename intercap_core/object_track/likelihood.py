@@ -87,8 +87,11 @@ def _depth(
     # share of pixels that see past the object (flying pixels, edges), and of pixels that something
     # other than a person hides
     log_past, log_hidden = float(np.log(0.03)), float(np.log(0.15))
+    room = np.zeros((0, 0), np.float32)
+    if view.background is not None:
+        room = view.background[drawn.window]
     total, count = depth_log_ratio(
-        drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, view.background,
+        drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth[drawn.window], room,
         geometry.depth_lens.rays, mesh.face_normals,
         geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
@@ -142,8 +145,8 @@ def depth_log_ratio(
 
     Args:
         rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the depth image.
-        measured: (H, W) depth in metres, 0 where invalid.
-        background: (H, W) depth of the empty room, 0 where unknown; or (0, 0).
+        measured: (h, w) depth in metres, 0 where invalid.
+        background: (h, w) depth of the empty room, 0 where unknown; or (0, 0).
         rays: (H, W, 2) of the depth lens.
         face_normals, rotation: (F, 3) unit normals and (3, 3) depth camera_from_object.
         colour_from_depth, colour: (4, 4), and (13,) parameters of the colour lens.
@@ -164,7 +167,7 @@ def depth_log_ratio(
             f = face[v, u]
             if f < 0:
                 continue
-            z = np.float64(measured[y0 + v, x0 + u])
+            z = np.float64(measured[v, u])
             if z <= 0:
                 continue
             count += 1
@@ -182,7 +185,7 @@ def depth_log_ratio(
             if covers(mask, x - mx, y - my):
                 total += max(shown, log_hidden)
             elif not covers(person, x - px, y - py):
-                known = background[y0 + v, x0 + u] if background.size else np.float32(0.0)
+                known = background[v, u] if background.size else np.float32(0.0)
                 is_room = known > 0 and abs(known - z) <= background_m
                 if not is_room or (shown < 0 and gap > -diameter):
                     total += max(shown, log_hidden)

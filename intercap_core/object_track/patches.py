@@ -57,7 +57,7 @@ class DepthPatch:
         assert colour_from_depth is not None
         person = view.person
         depth, points, trust = _lift(
-            view.depth, lens.rays, left, top, right, bottom, np.asarray(colour_from_depth),
+            view.depth[top:bottom, left:right], lens.rays, left, top, np.asarray(colour_from_depth),
             geometry.camera.master_from_depth, geometry.lens.parameters,
             mask.mask, mask.x0, mask.y0, person.mask, person.x0, person.y0,
         )  # fmt: skip
@@ -143,23 +143,23 @@ def _own(border, person):
 
 @numba.njit(cache=True, nogil=True)
 def _lift(
-    image, rays, left, top, right, bottom, colour_from_depth, master_from_depth, colour,
+    image, rays, left, top, colour_from_depth, master_from_depth, colour,
     mask, mx, my, person, px, py,
 ):  # fmt: skip
     """Compute depth, points and trust of a :class:`DepthPatch`.
 
-    The window of ``image`` includes left and top, but not right and bottom. Each pixel is lifted
+    ``image`` is a window of the depth image, whose first pixel is (left, top). Each pixel is lifted
     along its ray and projected into the colour image, whose masks decide its weight. Masks
     are given with their first pixels, in pixels of the reduced colour lens with parameters
     ``colour`` (13,).
     """
-    height, width = bottom - top, right - left
+    height, width = image.shape
     depth = np.zeros((height, width), np.float32)
     points = np.zeros((height, width, 3), np.float32)
     trust = np.full((height, width), np.float32(OUTSIDE_MASK_WEIGHT), np.float32)
     for v in range(height):
         for u in range(width):
-            z = np.float64(image[top + v, left + u])
+            z = np.float64(image[v, u])
             ray_x, ray_y = rays[top + v, left + u, 0], rays[top + v, left + u, 1]
             if not z > 0 or not np.isfinite(ray_x):
                 continue

@@ -16,7 +16,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Candidate, Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.object_track.view import PackedView, View, ViewGeometry, camera_distances
+from intercap_core.object_track.view import View, ViewGeometry, camera_distances
 from intercap_core.schemas import PERSON, SCENE
 
 TRACKING_FACES = 600  # of the rendered mesh; measured within 0.5 mm of the full mesh
@@ -146,41 +146,26 @@ class ObjectRecording:
 class ViewCache:
     """Least recently used cache of the views of frames.
 
-    The ``recent`` frames are kept as they are, others packed (:class:`.view.PackedView`). The
-    default ``max_bytes`` holds 70 frame sets of six cameras with depth at full resolution, or 280
-    with depth reduced as for a suitcase.
+    The default ``max_bytes`` holds 60 frame sets of six cameras with depth at full resolution, or
+    300 with depth reduced as for a suitcase.
     """
 
-    def __init__(
-        self, load: Callable[[int], list[View]], max_bytes: int = 320_000_000, recent: int = 4
-    ) -> None:
+    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = 320_000_000) -> None:
         self._load = load
-        self._max_bytes, self._most_recent = max_bytes, recent
-        self._recent: OrderedDict[int, list[View]] = OrderedDict()
-        self._packed: OrderedDict[int, list[PackedView]] = OrderedDict()
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[int, list[View]] = OrderedDict()
         self._bytes = 0
         self._lock = Lock()
 
     def __call__(self, t: int) -> list[View]:
         """Return the views of frame t, one per camera. One thread loads at a time."""
         with self._lock:
-            if t in self._recent:
-                self._recent.move_to_end(t)
-                return self._recent[t]
-            if t in self._packed:
-                self._packed.move_to_end(t)
-                views = [packed.unpack() for packed in self._packed[t]]
-            else:
-                views = self._load(t)
-                self._pack(t, views)
-            self._recent[t] = views
-            if len(self._recent) > self._most_recent:
-                self._recent.popitem(last=False)
-            return views
-
-    def _pack(self, t: int, views: list[View]) -> None:
-        self._packed[t] = [PackedView.of(view) for view in views]
-        self._bytes += sum(view.nbytes for view in self._packed[t])
-        while self._bytes > self._max_bytes and len(self._packed) > 1:
-            _, oldest = self._packed.popitem(last=False)
-            self._bytes -= sum(view.nbytes for view in oldest)
+            if t in self._kept:
+                self._kept.move_to_end(t)
+                return self._kept[t]
+            self._kept[t] = self._load(t)
+            self._bytes += sum(view.nbytes for view in self._kept[t])
+            while self._bytes > self._max_bytes and len(self._kept) > 1:
+                _, oldest = self._kept.popitem(last=False)
+                self._bytes -= sum(view.nbytes for view in oldest)
+            return self._kept[t]

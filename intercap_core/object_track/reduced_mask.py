@@ -48,32 +48,6 @@ class ReducedMask:
         return int(np.count_nonzero(self.mask))
 
 
-@dataclass(frozen=True, eq=False)
-class PackedMask:
-    """A :class:`ReducedMask` of one bit per pixel."""
-
-    x0: int
-    """Column of the first pixel in the reduced image."""
-    y0: int
-    """Row of the first pixel."""
-    shape: tuple[int, int]
-    """Height and width."""
-    bits: np.ndarray
-    """(h * w / 8,) uint8."""
-
-    @classmethod
-    def of(cls, mask: ReducedMask) -> PackedMask:
-        """Pack a mask."""
-        height, width = mask.mask.shape
-        return cls(mask.x0, mask.y0, (height, width), np.packbits(mask.mask))
-
-    def unpack(self) -> ReducedMask:
-        """Return the mask."""
-        height, width = self.shape
-        pixels = np.unpackbits(self.bits, count=height * width).view(bool)
-        return ReducedMask(self.x0, self.y0, pixels.reshape(self.shape))
-
-
 @numba.njit(cache=True, nogil=True)
 def cut(mask, x0, y0, left, top, height, width):
     """Return a mask (h, w) whose first pixel is (x0, y0) in the window from (left, top).

@@ -14,12 +14,33 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer, default_renderer
 from intercap_core.object_track.reduced_mask import (
     EMPTY,
-    PackedMask,
     ReducedMask,
     decode,
     reduced_lens,
     remove_person,
 )
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A reduced depth image as recorded, read by windows in metres without bias."""
+
+    millimetres: np.ndarray
+    """(h, w) uint16, 0 where invalid."""
+    bias_m: float
+    """Systematic error that is subtracted, metres."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Height and width."""
+        return self.millimetres.shape
+
+    def __getitem__(self, window: tuple[slice, slice]) -> np.ndarray:
+        """Return depth in a window, float32 metres, 0 where invalid."""
+        recorded = self.millimetres[window]
+        depth = recorded * np.float32(1e-3) - np.float32(self.bias_m)
+        depth[recorded == 0] = 0
+        return depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,21 +96,10 @@ class ViewGeometry:
             time_offset_s,
         )
 
-    def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Reduce depth (H, W) uint16 mm to float32 metres without bias, 0 where invalid."""
-        return self.metres(depth_mm[:: self.depth_step, :: self.depth_step])
-
-    def metres(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Convert depth (h, w) uint16 mm to float32 metres without bias, 0 where invalid."""
-        depth = depth_mm * np.float32(1e-3) - np.float32(self.depth_bias_m)
-        depth[depth_mm == 0] = 0
-        return depth
-
-    def millimetres(self, depth: np.ndarray) -> np.ndarray:
-        """Invert :meth:`metres`."""
-        recorded = np.rint((depth + np.float32(self.depth_bias_m)) * np.float32(1e3))
-        recorded[depth == 0] = 0
-        return recorded.astype(np.uint16)
+    def reduced_depth(self, depth_mm: np.ndarray) -> DepthImage:
+        """Reduce depth (H, W) uint16 mm."""
+        reduced = depth_mm[:: self.depth_step, :: self.depth_step]
+        return DepthImage(np.ascontiguousarray(reduced), self.depth_bias_m)
 
     @cached_property
     def depth_from_colour(self) -> np.ndarray:
@@ -134,31 +144,34 @@ class View:
 
     geometry: ViewGeometry
     """Camera and reduced lenses."""
-    depth: np.ndarray | None
-    """(h, w) float32 metres without bias on the reduced grid, 0 where invalid; None without depth.
-    """
+    depth: DepthImage | None
+    """Depth on the reduced grid; None without depth."""
     person: ReducedMask
     """Mask of the person."""
     candidates: tuple[MaskCandidate, ...]
     """Candidates, each with its reduced mask."""
     detected: bool = True
     """Whether the detector processed this image, so that the absence of candidates is evidence."""
-    background: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """(h, w) depth of the empty room in the form of ``depth``; (0, 0) if unknown."""
+    background: DepthImage | None = None
+    """Depth of the empty room in the form of ``depth``; None if unknown."""
 
     def through(self, geometry: ViewGeometry) -> View:
         """Return the same image with another camera pose, depth bias and time offset."""
 
-        def nearer(depth: np.ndarray) -> np.ndarray:
-            by = np.float32(geometry.depth_bias_m - self.geometry.depth_bias_m)
-            return np.where(depth > 0, depth - by, 0) if by else depth
-
+        bias = geometry.depth_bias_m
         return replace(
             self,
             geometry=geometry,
-            depth=None if self.depth is None else nearer(self.depth),
-            background=nearer(self.background),
+            depth=self.depth and replace(self.depth, bias_m=bias),
+            background=self.background and replace(self.background, bias_m=bias),
         )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of depth and masks, bytes; frames share the background."""
+        masks = [self.person, *(candidate.mask for candidate in self.candidates)]
+        depth = 0 if self.depth is None else self.depth.millimetres.nbytes
+        return depth + sum(mask.mask.nbytes for mask in masks)
 
     @classmethod
     def build(
@@ -168,7 +181,7 @@ class View:
         person_rle: bytes,
         candidates: list[tuple[int, str, bytes]],
         detected: bool = True,
-        background: np.ndarray | None = None,
+        background: DepthImage | None = None,
     ) -> View:
         """Reduce one image.
 
@@ -195,53 +208,7 @@ class View:
             for candidate in whole
             if (part := remove_person(candidate.mask, person, step)) is not None
         )
-        room = np.zeros((0, 0), np.float32) if background is None else background
-        return cls(geometry, depth, person, whole + parts, detected, room)
-
-
-@dataclass(frozen=True, eq=False)
-class PackedView:
-    """A view in less than half of its memory: depth in millimetres, masks as bits."""
-
-    view: View
-    """The view without depth and masks."""
-    depth: np.ndarray | None
-    """(h, w) uint16 mm as recorded; None without depth."""
-    person: PackedMask
-    """Mask of the person."""
-    candidates: tuple[PackedMask, ...]
-    """Mask of each candidate."""
-
-    @classmethod
-    def of(cls, view: View) -> PackedView:
-        """Pack a view."""
-        return cls(
-            replace(
-                view,
-                depth=None,
-                person=EMPTY,
-                candidates=tuple(replace(one, mask=EMPTY) for one in view.candidates),
-            ),
-            None if view.depth is None else view.geometry.millimetres(view.depth),
-            PackedMask.of(view.person),
-            tuple(PackedMask.of(candidate.mask) for candidate in view.candidates),
-        )
-
-    def unpack(self) -> View:
-        """Return the view."""
-        candidates = zip(self.view.candidates, self.candidates, strict=True)
-        return replace(
-            self.view,
-            depth=None if self.depth is None else self.view.geometry.metres(self.depth),
-            person=self.person.unpack(),
-            candidates=tuple(replace(one, mask=mask.unpack()) for one, mask in candidates),
-        )
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of depth and masks, bytes; frames share the background."""
-        masks = sum(mask.bits.nbytes for mask in (self.person, *self.candidates))
-        return masks + (0 if self.depth is None else self.depth.nbytes)
+        return cls(geometry, depth, person, whole + parts, detected, background)
 
 
 @dataclass(frozen=True)

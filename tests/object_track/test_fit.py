@@ -15,7 +15,7 @@ from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.likelihood import LABEL_LOG_RATIO, LOG_MISSED, outline_cost
 from intercap_core.object_track.reduced_mask import ReducedMask
-from intercap_core.object_track.view import FitContext
+from intercap_core.object_track.view import DepthImage, FitContext
 from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
 from tests.object_track.scenes import disturb, mesh_of, views_of
@@ -138,6 +138,11 @@ def test_unobserved_poses_have_no_likelihood(unlabelled, capture, views):
     assert ratios(unlabelled, blind, capture.poses[:1]) == pytest.approx(0, abs=1e-9)
 
 
+def farther(depth: DepthImage) -> DepthImage:
+    """The image with depths that are 0.5 m larger."""
+    return replace(depth, bias_m=depth.bias_m - 0.5)
+
+
 def test_depth_of_the_empty_room_is_no_evidence_outside_masks(unlabelled, capture, views):
     pose = capture.poses[:1]
     unseen = [replace(view, candidates=()) for view in views]
@@ -146,7 +151,7 @@ def test_depth_of_the_empty_room_is_no_evidence_outside_masks(unlabelled, captur
     assert fits > 10 and ratios(unlabelled, room, pose)[0] <= 0
     in_mask = [replace(view, background=view.depth) for view in views]
     assert ratios(unlabelled, in_mask, pose)[0] > 0.9 * ratios(unlabelled, views, pose)[0]
-    before_wall = [replace(view, background=view.depth + np.float32(0.5)) for view in unseen]
+    before_wall = [replace(view, background=farther(view.depth)) for view in unseen]
     assert ratios(unlabelled, before_wall, pose)[0] == pytest.approx(fits)
 
 
@@ -159,7 +164,8 @@ def test_only_furniture_more_than_a_diameter_ahead_may_hide_the_object(
     hidden = []
     for view in views:
         centre = view.geometry.camera.depth_from_master @ [*capture.mesh.centre_at(pose), 1]
-        depth = np.full_like(view.depth, centre[2] - ahead_m)
+        ahead_mm = np.uint16(round(1e3 * (centre[2] - ahead_m)))
+        depth = DepthImage(np.full(view.depth.shape, ahead_mm), 0.0)
         background = depth if is_room else view.background
         hidden.append(replace(view, depth=depth, background=background, candidates=()))
     ratio = ratios(unlabelled, hidden, pose[None])[0]

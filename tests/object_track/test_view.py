@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -17,13 +19,7 @@ from intercap_core.object_track.reduced_mask import (
     reduced_lens,
     remove_person,
 )
-from intercap_core.object_track.view import (
-    MaskCandidate,
-    PackedView,
-    View,
-    ViewGeometry,
-    camera_distances,
-)
+from intercap_core.object_track.view import View, ViewGeometry, camera_distances
 from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH
 
 RNG = np.random.default_rng(0)
@@ -115,13 +111,13 @@ def test_distances_of_cameras_are_medians_over_known_joints():
 
 def test_the_cache_evicts_the_least_recently_used_frames():
     loaded = []
-    person = ReducedMask(2, 3, np.ones((8, 100), bool))  # 100 bytes packed
+    person = ReducedMask(2, 3, np.ones((8, 100), bool))
 
     def load(t: int) -> list[View]:
         loaded.append(t)
         return [View(None, None, person, ()) for _ in range(2)]
 
-    views = ViewCache(load, max_bytes=600, recent=1)  # three frames
+    views = ViewCache(load, max_bytes=4800)  # three frames of 1600 bytes
     for t in (0, 1, 2, 0, 1, 2):
         assert views(t) is views(t)
     assert loaded == [0, 1, 2]
@@ -134,24 +130,18 @@ def test_the_cache_evicts_the_least_recently_used_frames():
     assert small(0) is small(0)
 
 
-def test_a_packed_view_is_unpacked_without_loss():
-    rng = np.random.default_rng(0)
+def test_windows_of_depth_are_metres_without_bias():
+    depth_mm = RNG.integers(1, 9000, (DEPTH.height, DEPTH.width)).astype(np.uint16)
+    depth_mm[RNG.random(depth_mm.shape) > 0.8] = 0  # invalid
     camera = Camera("k1", COLOUR, DEPTH, COLOUR_FROM_DEPTH, np.eye(4))
-    depth_mm = rng.integers(0, 9000, (DEPTH.height, DEPTH.width))
-    depth_mm[rng.random(depth_mm.shape) > 0.8] = 0  # invalid
     geometry = ViewGeometry.for_object(camera, 0.3, 2.5, depth_bias_m=0.00731)
-    mask = ReducedMask(5, 7, rng.random((31, 13)) > 0.5)
-    candidates = (MaskCandidate(0, "cup", mask), MaskCandidate(3, "", EMPTY))
-    depth = geometry.reduced_depth(depth_mm.astype(np.uint16))
-    view = View(geometry, depth, mask, candidates, False)
-    again = PackedView.of(view).unpack()
-    np.testing.assert_array_equal(again.depth, depth)
-    assert (again.geometry, again.detected, again.background) == (geometry, False, view.background)
-    for one, other in zip(
-        (view.person, *(c.mask for c in candidates)),
-        (again.person, *(c.mask for c in again.candidates)),
-        strict=True,
-    ):
-        assert (one.x0, one.y0) == (other.x0, other.y0)
-        np.testing.assert_array_equal(one.mask, other.mask)
-    assert [(c.index, c.label) for c in again.candidates] == [(0, "cup"), (3, "")]
+    view = View(geometry, geometry.reduced_depth(depth_mm), EMPTY, ())
+    every = slice(None, None, geometry.depth_step)
+    reduced = depth_mm[every, every]
+    assert view.depth.shape == reduced.shape and view.nbytes == reduced.nbytes
+    window = slice(3, 40), slice(5, 17)
+    for bias in (0.00731, -0.02):
+        seen = view.through(replace(geometry, depth_bias_m=bias)).depth[window]
+        expected = np.where(reduced > 0, reduced * 1e-3 - bias, 0)[window]
+        np.testing.assert_allclose(seen, expected, atol=1e-6)
+        assert seen.dtype == np.float32

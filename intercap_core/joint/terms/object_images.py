@@ -84,9 +84,9 @@ class ObjectImages:
         )
 
     def _cache(self) -> ViewCache:
-        """An empty cache; its 200 MB hold 22 to 350 frames of six cameras."""
+        """An empty cache."""
         recording, first = self.recording, self.first  # no reference to self: it frees the cache
-        return ViewCache(lambda t: recording.views(first + t), 200_000_000)
+        return ViewCache(lambda t: recording.views(first + t))
 
     def view(self, t: int, place: int) -> View:
         """View of camera number ``place`` of the recording in frame t; not cached."""
