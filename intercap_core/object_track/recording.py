@@ -146,11 +146,11 @@ class ObjectRecording:
 class ViewCache:
     """Least recently used cache of the views of frames.
 
-    The default ``max_bytes`` holds 60 frame sets of six cameras with depth at full resolution, or
-    300 with depth reduced as for a suitcase.
+    The default ``max_bytes`` holds 80 frame sets of six cameras with depth at full resolution, or
+    370 with depth reduced as for a suitcase.
     """
 
-    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = 320_000_000) -> None:
+    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = 400_000_000) -> None:
         self._load = load
         self._max_bytes = max_bytes
         self._kept: OrderedDict[int, list[View]] = OrderedDict()
