@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from pathlib import Path
 
@@ -55,33 +54,64 @@ def run(
         fit_settings: settings of the fits, for the refits of the held-out evaluation.
         truth: truth file of a virtual recording; None = no truth.
     """
-    object_, body_models, gender = models.object_, models.body_models, models.gender
-    with artefacts.read(paths.joint, JOINT) as fitted:
+    body_track = read_body(paths.joint, "joint", models.body_models, models.gender)
+    with (
+        artefacts.read(paths.scene, SCENE) as setting,
+        artefacts.read(paths.joint, JOINT) as fitted,
+    ):
         made_by = {k: v for k, v in fitted.attributes.items() if k == "made_by"}
-    mesh = None if object_ is None else ObjectMesh.load(object_)
-    fitted_body = read_body(paths.joint, "joint", body_models, gender)
-    fitted_object = read_object(paths.joint, "joint")
-    with contextlib.ExitStack() as stack:
-        images = stack.enter_context(Frames.open(paths.frames))
-        setting = stack.enter_context(artefacts.read(paths.scene, SCENE))
-        fitted = stack.enter_context(artefacts.read(paths.joint, JOINT))
-        images = images.showing(setting["image_of"])
         rig = Rig.from_artefact(setting).moved(fitted["master_from_colour"])
+    # Clouds, truth and distances grow with the recording and are released before the verdict. Rig
+    # and body are not: their cached ray tables are used again.
+    values, flags, attributes = _measure(paths, models, settings, truth, rig, body_track)
+    with artefacts.write(
+        output, METRICS, settings_digest=digest(settings), **attributes, **made_by
+    ) as writer:
+        for key in sorted(values):
+            writer.put(key, values.pop(key))
+        flags.write(writer)
+        # The error model of the verdict was fitted to results of this program, so imported results
+        # have none.
+        if settings.hold_out and not made_by:
+            for key, value in sorted(reach_verdict(paths, models, fit_settings).items()):
+                writer.put(f"verdict/{key}", value)
+
+
+def _measure(
+    paths: SequencePaths,
+    models: SequenceModels,
+    settings: MetricsSettings,
+    truth: Path | None,
+    rig: Rig,
+    body_track: BodyTrack,
+) -> tuple[Values, Flags, dict[str, object]]:
+    """Datasets of the metrics artefact except the verdict, its flags and its attributes.
+
+    ``rig`` and ``body_track`` are those of the joint fit.
+    """
+    object_, body_models, gender = models.object_, models.body_models, models.gender
+    mesh = None if object_ is None else ObjectMesh.load(object_)
+    object_track = read_object(paths.joint, "joint")
+    with (
+        Frames.open(paths.frames) as recording,
+        artefacts.read(paths.scene, SCENE) as setting,
+        artefacts.read(paths.joint, JOINT) as fitted,
+    ):
+        images = recording.showing(setting["image_of"])
         clouds = read_clouds(images, rig, fitted["depth_bias"], setting["image_of"], paths)
         known = None
         if truth is not None:
-            vertices = fitted_body.model.num_vertices
+            vertices = body_track.model.num_vertices
             known = truths.Truth.load(truth, images.time_s, images.fps, vertices)
         handled = None
-        if mesh is not None and fitted_object.known:
-            handled = HandledObject(mesh, fitted_object)
-        measured = Measurement(handled, fitted_body, clouds, rig, settings.contact_mm * 1e-3)
+        if mesh is not None and object_track.known:
+            handled = HandledObject(mesh, object_track)
+        measured = Measurement(handled, body_track, clouds, rig, settings.contact_mm * 1e-3)
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
         true_distance = values.pop("true_distance", None)
         true_facing = values.pop("true_facing", None)
         _warn_of_foreign_truth(truth, values)
-        values |= _motion(fitted_body, handled, images.fps)
-        flags = _flags(images, paths, has_object=object_ is not None)
+        values |= _motion(body_track, handled, images.fps)
         if handled is not None:
             values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
@@ -92,30 +122,25 @@ def run(
             )
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
-            values |= errors.of_object("joint", fitted_object)
+            values |= errors.of_object("joint", object_track)
             values |= errors.of_body(
-                "joint", fitted_body, fitted_object, values.get("body_contact_distance")
+                "joint", body_track, object_track, values.get("body_contact_distance")
             )
-            values |= errors.about_truth(fitted_body.model.regions) | _extrinsics_errors(
+            values |= errors.about_truth(body_track.model.regions) | _extrinsics_errors(
                 setting, fitted["master_from_colour"], known
             )
-        attributes = {
-            "sequence": images.sequence,
-            "subject": models.subject.subject,
-            "object": object_.name if object_ else "",
-            "fps": images.fps,
-            "has_truth": known is not None,
-            **made_by,
-        }
-    with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
-        for key in sorted(values):
-            writer.put(key, values.pop(key))
-        flags.write(writer)
-        # The error model of the verdict was fitted to results of this program, so imported results
-        # have none. Rig and body are still referenced here: their cached ray tables are used again.
-        if settings.hold_out and not made_by:
-            for key, value in sorted(reach_verdict(paths, models, fit_settings).items()):
-                writer.put(f"verdict/{key}", value)
+        flags = _flags(images, paths, has_object=object_ is not None)
+        return (
+            values,
+            flags,
+            {
+                "sequence": images.sequence,
+                "subject": models.subject.subject,
+                "object": object_.name if object_ else "",
+                "fps": images.fps,
+                "has_truth": known is not None,
+            },
+        )
 
 
 def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) -> Values:

@@ -19,7 +19,7 @@ def _box(x: slice, y: slice) -> np.ndarray:
 
 def _candidates(*drawn: np.ndarray) -> list[Candidate]:
     return [
-        Candidate(i, "thing", 0.9, np.zeros(4), masks.encode(mask), (WIDTH, HEIGHT))
+        Candidate(i, "thing", 0.9, masks.encode(mask), (WIDTH, HEIGHT))
         for i, mask in enumerate(drawn)
     ]
 

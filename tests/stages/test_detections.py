@@ -93,7 +93,7 @@ def test_files_reach_the_sets_that_hold_their_image(tmp_path):
     assert len(read.people(2, 0)) == len(read.people(3, 0)) == 0
     found = read.candidates(1, 1)
     assert [c.label for c in found] == ["person", "cup"] and [c.index for c in found] == [0, 1]
-    assert [c.box[0] for c in found] == [300, 500]
+    assert [c.runs.box[0] for c in found] == [300, 500]
     np.testing.assert_array_equal(found[1].mask(), square(500) > 0)
     assert read.candidates(0, 1) == [] and read.candidates(0, 0) == []
     assert "000000000002_keypoints.json" in read.notes[0]
@@ -183,7 +183,7 @@ def test_ids_are_resolved_by_the_list_of_images(candidates):
     (candidates / "k1.json").write_text(json.dumps(content))
     read = run(candidates.parent)
     assert read.candidates_found[:, 0].tolist() == [True, True, True, False]
-    assert [c.box[0] for t in range(SETS) for c in read.candidates(t, 0)] == [300, 310]
+    assert [c.runs.box[0] for t in range(SETS) for c in read.candidates(t, 0)] == [300, 310]
 
 
 def test_unrelated_numbers_in_names_are_ignored(candidates):
@@ -233,7 +233,7 @@ def test_masks_as_images(candidates):
     assert read.candidates_found[:, 0].all() and read.notes[0] == ""
     labels = [[c.label for c in read.candidates(t, 0)] for t in range(SETS)]
     assert labels == [["cup", "sports ball"], ["", ""], ["cup"], ["cup", ""]]
-    places = [[c.box[0] for c in read.candidates(t, 0)] for t in range(SETS)]
+    places = [[c.runs.box[0] for c in read.candidates(t, 0)] for t in range(SETS)]
     assert places == [[500, 300], [300, 500], [300], [300, 500]]
 
 

@@ -35,8 +35,6 @@ class Candidate:
     """Name of the class; "" = unknown."""
     score: float
     """From 0 to 1."""
-    box: np.ndarray
-    """(4,) x, y, width, height, px."""
     rle: bytes
     """Mask as compressed COCO RLE; parsed on first use."""
     image_size: tuple[int, int]
@@ -77,7 +75,20 @@ class _CameraTable:
     candidate_offsets: np.ndarray
     labels: list[str]
     scores: np.ndarray
-    boxes: np.ndarray
+    rle_offsets: np.ndarray
+    rle: bytes
+
+
+@dataclass(frozen=True)
+class _ImageTable:
+    """Candidates of stage ``person``. Moment t of camera c is image t C + c."""
+
+    alone: bool
+    """They replace the detector's candidates."""
+    offsets: np.ndarray
+    """Image i has the rows from ``offsets[i]`` up to ``offsets[i + 1]``."""
+    scores: np.ndarray
+    extents: np.ndarray
     rle_offsets: np.ndarray
     rle: bytes
 
@@ -109,7 +120,7 @@ class Detections:
         self.notes = tuple(artefact.text("note"))
         self._tables = [_read_camera(artefact, name) for name in self.camera_names]
         self._image_of: np.ndarray | None = None
-        self._from_images: dict[tuple[int, int], list[Candidate]] = {}
+        self._from_images: _ImageTable | None = None
 
     @classmethod
     def load(cls, path: Path) -> Detections:
@@ -159,33 +170,19 @@ class Detections:
             alone = bool(artefact.attributes["images_alone"])
             if not alone and "candidate_offsets" not in artefact:
                 return self
-            scores, extents = artefact["candidate_scores"], artefact["candidate_extents"]
-            rle = artefacts.unpack_ragged(
-                artefact["candidate_rle_offsets"], artefact["candidate_rle"]
+            table = _ImageTable(
+                alone=alone,
+                offsets=artefact["candidate_offsets"],
+                scores=artefact["candidate_scores"],
+                extents=artefact["candidate_extents"],
+                rle_offsets=artefact["candidate_rle_offsets"],
+                rle=artefact["candidate_rle"].tobytes(),
             )
-            offsets = artefact["candidate_offsets"]
         both = copy(self)
-        both.candidates_found = self.candidates_found & (not alone)
-        both._from_images = {}
-        for t, c in np.ndindex(source.shape):
-            image = t * source.shape[1] + c
-            first, last = int(offsets[image]), int(offsets[image + 1])
-            named = [] if alone else self.candidates(t, c)
-            # An image without foreground may still show the object, so it stays "not found".
-            both.candidates_found[t, c] |= last > first
-            width, height = (int(n) for n in self.image_sizes[c])
-            both._from_images[t, c] = named + [
-                Candidate(
-                    index=len(named) + i - first,
-                    label=UNKNOWN_LABEL,
-                    score=float(scores[i]),
-                    box=np.array(Runs(rle[i], height, width).box),
-                    rle=rle[i],
-                    image_size=(width, height),
-                    extent_m=float(extents[i]),
-                )
-                for i in range(first, last)
-            ]
+        both._from_images = table
+        # An image without foreground may still show the object, so it stays "not found".
+        found = (np.diff(table.offsets) > 0).reshape(source.shape)
+        both.candidates_found = found if alone else self.candidates_found | found
         return both
 
     def _image(self, t: int, c: int) -> int:
@@ -204,20 +201,38 @@ class Detections:
         return table.people[table.people_offsets[image] : table.people_offsets[image + 1]]
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
-        """The image's segmentation candidates, in the order of the artefact."""
-        if (t, c) in self._from_images:
-            return self._from_images[t, c]
+        """The image's segmentation candidates, in the order of the artefacts."""
+        table = self._from_images
+        if table is None:
+            return self._of_detector(t, c)
+        found = [] if table.alone else self._of_detector(t, c)
+        image = t * len(self.camera_names) + c
+        first, last = table.offsets[image : image + 2].tolist()
+        width, height = self.image_sizes[c].tolist()
+        return found + [
+            Candidate(
+                index=len(found) + i - first,
+                label=UNKNOWN_LABEL,
+                score=float(table.scores[i]),
+                rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
+                image_size=(width, height),
+                extent_m=float(table.extents[i]),
+            )
+            for i in range(first, last)
+        ]
+
+    def _of_detector(self, t: int, c: int) -> list[Candidate]:
+        """The detector's candidates of the image."""
         table, image = self._tables[c], self._image(t, c)
         if image < 0:
             return []
-        first, last = table.candidate_offsets[image : image + 2]
-        width, height = (int(n) for n in self.image_sizes[c])
+        first, last = table.candidate_offsets[image : image + 2].tolist()
+        width, height = self.image_sizes[c].tolist()
         return [
             Candidate(
-                index=int(i - first),
+                index=i - first,
                 label=table.labels[i],
                 score=float(table.scores[i]),
-                box=table.boxes[i],
                 rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
                 image_size=(width, height),
             )
@@ -233,7 +248,6 @@ def _read_camera(artefact: artefacts.Artefact, name: str) -> _CameraTable:
         candidate_offsets=artefact[f"{group}/candidate_offsets"],
         labels=artefact.text(f"{group}/candidate_labels"),
         scores=artefact[f"{group}/candidate_scores"],
-        boxes=artefact[f"{group}/candidate_boxes"],
         rle_offsets=artefact[f"{group}/rle_offsets"],
         rle=artefact[f"{group}/rle"].tobytes(),
     )
