@@ -12,7 +12,8 @@ the stages (``Stage.resources`` in ``intercap_core.stage_list``) are derived fro
 
 With ``--cameras``, the studio makes the first recording with each number of cameras, in
 ``results/<dataset>/cameras_<number>``. All stages up to the last of ``--stages`` are measured on it
-in order, at its own length.
+in order, at its own length. With ``--frames`` as well, these recordings, which must then have been
+measured before, are extended to each length.
 
 A recording is repeated forward and backward, so that motion is continuous: every dataset with a
 frame axis in the stage's inputs is extended. Images are not copied; the new frames refer to the
@@ -23,6 +24,7 @@ is suited to measure time and memory, not errors; it has no truth.
 from __future__ import annotations
 
 import argparse
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -226,16 +228,20 @@ def run_apart(settings: Path, stage: str, *options: str) -> Row | None:
     return row
 
 
-def measure(settings: Path, frames: int, stages: Sequence[str]) -> list[Row]:
-    """Print and return the rows of ``stages``, which read artefacts, on ``frames`` frames."""
-    project = load_project(settings)
+def measure(settings: Path, frames: int, stages: Sequence[str], cameras: int = 0) -> list[Row]:
+    """Print and return the rows of ``stages``, which read artefacts, on ``frames`` frames.
+
+    ``cameras`` is as in :func:`load_rig`.
+    """
+    project = load_rig(settings, cameras)
     sequence = next(iter(project.sequences))
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         made = {name for stage in stages for name in STAGES[stage].reads}
         for stage in (name for name in STAGES if name in made):
             source = project.artefact(sequence, stage)
             lengthen(source, stage, Path(folder) / f"{stage}.h5", frames)
-        rows = [run_apart(settings, stage, "--folder", folder) for stage in stages]
+        options = ("--folder", folder, "--cameras", str(cameras))
+        rows = [run_apart(settings, stage, *options) for stage in stages]
     return [row for row in rows if row]
 
 
@@ -321,20 +327,21 @@ def run(settings: Path, stage: str, folder: Path | None, cameras: int) -> None:
 def _main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("settings", type=Path, nargs="?", default=Path("config/bench/config.yaml"))
-    lengths = parser.add_mutually_exclusive_group()
-    lengths.add_argument("--frames", type=int, nargs="+", default=[45, 300])
-    lengths.add_argument("--cameras", type=int, nargs="+")
+    parser.add_argument("--frames", type=int, nargs="+", default=[])
+    parser.add_argument("--cameras", type=int, nargs="+", default=[])
     parser.add_argument("--stages", nargs="+", choices=FROM_ARTEFACTS, default=FROM_ARTEFACTS)
     parser.add_argument("--stage", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    settings, stages = given.settings, given.stages
     if given.stage:
-        run(given.settings, given.stage, given.folder, given.cameras[0] if given.cameras else 0)
-    elif given.cameras:
+        run(settings, given.stage, given.folder, *given.cameras)
+    elif given.cameras and not given.frames:
         for cameras in given.cameras:
-            measure_rig(given.settings, cameras, given.stages)
+            measure_rig(settings, cameras, stages)
     else:
-        print_laws([row for n in given.frames for row in measure(given.settings, n, given.stages)])
+        rigs = itertools.product(given.cameras or [0], given.frames or [45, 300])
+        print_laws([row for c, n in rigs for row in measure(settings, n, stages, c)])
 
 
 if __name__ == "__main__":
