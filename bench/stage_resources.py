@@ -7,8 +7,11 @@ The first sequence of the project, which must be computed, is extended to each l
 runs in a separate process and prints one row: stage, cameras, frames, CPU seconds and peak memory.
 From the two greatest lengths follow the law of each stage, linear in the frames and never
 decreasing, and ``scale.long_recording_mb``: the largest peak of a recording of 10 minutes at 30
-frames per second by these laws. The largest measured peak is its lower bound. The resource needs of
-the stages (``Stage.resources`` in ``intercap_core.stage_list``) are derived from it.
+frames per second by these laws. The largest measured peak is its lower bound. For stages that work
+in windows (``JobResources.window``), choose lengths with full windows, such as 1200 and 2400.
+Measure twice after a change of the code: the first run compiles kernels, which adds time and up to
+310 MB. The resource needs of the stages (``Stage.resources`` in ``intercap_core.stage_list``) are
+derived from these figures.
 
 With ``--cameras``, the studio makes the first recording with each number of cameras, in
 ``results/<dataset>/cameras_<number>``. All stages up to the last of ``--stages`` are measured on it

@@ -30,8 +30,9 @@ class Extent:
 class JobResources:
     """Peak memory and time of a job, linear in frames and images.
 
+    A stage that works in windows of frames also needs memory for the images of one window.
     Measured with ``python -m bench.stage_resources`` on 45 to 1,000 frames of six 1080p cameras and
-    45 frames of three.
+    45 frames of two, three and twelve.
     """
 
     mb: float
@@ -40,6 +41,10 @@ class JobResources:
     """Additional megabytes per frame set."""
     mb_per_image: float = 0.0
     """Additional megabytes per image."""
+    window: int = 0
+    """Largest number of frames of a window, with its overlap."""
+    mb_per_window_image: float = 0.0
+    """Additional megabytes per image of the window."""
     seconds: float = 10.0
     """Time independent of the recording, seconds."""
     seconds_per_image: float = 0.0
@@ -47,7 +52,13 @@ class JobResources:
 
     def memory_mb(self, extent: Extent) -> float:
         """Peak memory for a sequence, megabytes."""
-        return self.mb + self.mb_per_frame * extent.frames + self.mb_per_image * extent.images
+        window = min(extent.frames, self.window) * extent.cameras
+        return (
+            self.mb
+            + self.mb_per_frame * extent.frames
+            + self.mb_per_image * extent.images
+            + self.mb_per_window_image * window
+        )
 
     def time_s(self, extent: Extent) -> float:
         """Seconds for a sequence."""
@@ -110,7 +121,7 @@ STAGES: dict[str, Stage] = {
                 "candidates",
             ),
             layout_columns={"behave": ("object",)},  # BEHAVE names its files after the object
-            resources=JobResources(140, mb_per_image=0.03, seconds=5, seconds_per_image=0.01),
+            resources=JobResources(240, mb_per_image=0.005, seconds=5, seconds_per_image=0.01),
             output_bytes=5_000_000,
         ),
         Stage(
@@ -124,7 +135,7 @@ STAGES: dict[str, Stage] = {
             name="person",
             purpose="The subject over views, and the triangulated keypoints.",
             reads=("frames", "detections", "scene"),
-            resources=JobResources(520, mb_per_image=0.045, seconds_per_image=0.02),
+            resources=JobResources(640, mb_per_image=0.02, seconds_per_image=0.02),
             output_bytes=7_000_000,
         ),
         Stage(
@@ -139,7 +150,7 @@ STAGES: dict[str, Stage] = {
             name="body_fit",
             purpose="SMPL-X parameters in every frame.",
             reads=("frames", "scene", "person"),
-            resources=JobResources(780, mb_per_image=0.05, seconds=15, seconds_per_image=0.06),
+            resources=JobResources(900, mb_per_image=0.01, seconds=15, seconds_per_image=0.06),
             output_bytes=1_100_000,
             estimates=True,
         ),
@@ -147,7 +158,10 @@ STAGES: dict[str, Stage] = {
             name="joint",
             purpose="Body and object together, over all frames, with contact.",
             reads=_FITS,
-            resources=JobResources(800, mb_per_frame=3.7, seconds=20, seconds_per_image=0.06),
+            resources=JobResources(
+                690, mb_per_image=0.05, window=460, mb_per_window_image=0.5,
+                seconds=20, seconds_per_image=0.06,
+            ),
             output_bytes=700_000,
             estimates=True,
         ),
@@ -155,7 +169,10 @@ STAGES: dict[str, Stage] = {
             name="metrics",
             purpose="Distances, penetration, and errors against truth where it is known.",
             reads=(*_FITS, "joint"),
-            resources=JobResources(750, mb_per_image=0.9, seconds=15, seconds_per_image=0.06),
+            resources=JobResources(
+                720, mb_per_image=0.05, window=360, mb_per_window_image=0.7,
+                seconds=15, seconds_per_image=0.06,
+            ),
             output_bytes=5_000_000,
         ),
         Stage(
@@ -171,7 +188,7 @@ STAGES: dict[str, Stage] = {
             purpose="The sequence's page of the site.",
             reads=_ALL,
             columns=("intent",),
-            resources=JobResources(620, mb_per_image=0.3, seconds=20, seconds_per_image=0.03),
+            resources=JobResources(680, mb_per_image=0.3, seconds=20, seconds_per_image=0.03),
             output_bytes=15_000_000,
             folder_marker="index.html",
         ),

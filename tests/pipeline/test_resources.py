@@ -34,14 +34,22 @@ from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig
 SHORT, LONG, FEW = Extent(45, 6), Extent(1000, 6), Extent(1000, 2)
 # Largest resident set of the stage's process, MB: frames, cameras, measured.
 MEASURED = [
-    ("frames", 45, 6, 160), ("detections", 45, 6, 138),
-    ("person", 300, 6, 494), ("person", 1000, 6, 788),
-    ("scene", 45, 3, 390), ("scene", 300, 6, 541), ("scene", 1000, 6, 668),
-    ("object_track", 45, 3, 429), ("object_track", 300, 6, 905), ("object_track", 1000, 6, 974),
-    ("body_fit", 45, 3, 562), ("body_fit", 300, 6, 907), ("body_fit", 1000, 6, 1102),
-    ("joint", 45, 3, 767), ("joint", 300, 6, 1963), ("joint", 1000, 6, 4400),
-    ("metrics", 45, 6, 986), ("summary", 300, 6, 383), ("page", 45, 6, 772),
-    ("export", 45, 6, 648),
+    ("frames", 45, 6, 160), ("frames", 45, 12, 143),
+    ("detections", 45, 2, 226), ("detections", 45, 12, 231),
+    ("person", 45, 2, 564), ("person", 45, 12, 770), ("person", 300, 6, 748),
+    ("person", 1000, 6, 788),
+    ("scene", 45, 2, 339), ("scene", 45, 12, 597), ("scene", 300, 6, 541), ("scene", 1000, 6, 668),
+    ("object_track", 45, 3, 407), ("object_track", 45, 12, 645), ("object_track", 300, 6, 905),
+    ("object_track", 1000, 6, 974),
+    ("body_fit", 45, 2, 605), ("body_fit", 45, 12, 724), ("body_fit", 300, 6, 982),
+    ("body_fit", 1000, 6, 895),
+    ("joint", 45, 2, 752), ("joint", 45, 12, 1046), ("joint", 300, 6, 1628),
+    ("joint", 1000, 6, 2115),
+    ("metrics", 45, 2, 797), ("metrics", 45, 12, 1186), ("metrics", 300, 6, 1978),
+    ("metrics", 1000, 6, 2179),
+    ("summary", 45, 2, 393), ("summary", 45, 12, 393), ("summary", 300, 6, 383),
+    ("page", 45, 2, 823), ("page", 45, 12, 901),
+    ("export", 45, 2, 591), ("export", 45, 12, 748),
 ]  # fmt: skip
 
 
