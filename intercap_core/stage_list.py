@@ -150,7 +150,7 @@ STAGES: dict[str, Stage] = {
             name="body_fit",
             purpose="SMPL-X parameters in every frame.",
             reads=("frames", "scene", "person"),
-            resources=JobResources(900, mb_per_image=0.01, seconds=15, seconds_per_image=0.06),
+            resources=JobResources(800, mb_per_image=0.05, seconds=15, seconds_per_image=0.06),
             output_bytes=1_100_000,
             estimates=True,
         ),
