@@ -21,7 +21,7 @@ either side, since only neighbouring frames are coupled: memory does not grow wi
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any
 
@@ -265,6 +265,7 @@ def _hold_out(
     inputs: JointInputs, settings: JointSettings, result: JointResult, cameras: np.ndarray
 ) -> HeldOut:
     """Evaluate one window of frames; ``cameras`` (V,) are those to hold out."""
+    inputs = replace(inputs, images=inputs.images and inputs.images.uncached())
     assembly = assemble(inputs, settings)
     state = result.state
     _fix_to_result(assembly, result)

@@ -83,10 +83,10 @@ class ObjectImages:
             self.mesh, labels, settings.min_overlap, settings.background_term, renderer
         )
 
-    def _cache(self) -> ViewCache:
+    def _cache(self, **limits: int) -> ViewCache:
         """An empty cache."""
         recording, first = self.recording, self.first  # no reference to self: it frees the cache
-        return ViewCache(lambda t: recording.views(first + t))
+        return ViewCache(lambda t: recording.views(first + t), **limits)
 
     def view(self, t: int, place: int) -> View:
         """View of camera number ``place`` of the recording in frame t; not cached."""
@@ -98,6 +98,12 @@ class ObjectImages:
         window.first = self.first + frames.start
         window.views = window._cache()
         return window
+
+    def uncached(self) -> ObjectImages:
+        """The same images for a caller that compares each frame once, without a cache of views."""
+        single = copy(self)
+        single.views = single._cache(max_bytes=0)
+        return single
 
 
 @dataclass(frozen=True, eq=False)
