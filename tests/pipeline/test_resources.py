@@ -41,7 +41,7 @@ MEASURED = [
     ("scene", 45, 2, 339), ("scene", 45, 12, 597), ("scene", 300, 6, 541), ("scene", 1000, 6, 668),
     ("object_track", 45, 3, 407), ("object_track", 45, 12, 645), ("object_track", 300, 6, 905),
     ("object_track", 1000, 6, 974),
-    ("body_fit", 45, 2, 605), ("body_fit", 45, 12, 724), ("body_fit", 300, 6, 982),
+    ("body_fit", 45, 2, 605), ("body_fit", 45, 12, 724), ("body_fit", 300, 6, 753),
     ("body_fit", 1000, 6, 895),
     ("joint", 45, 2, 752), ("joint", 45, 12, 1046), ("joint", 300, 6, 1628),
     ("joint", 1000, 6, 2115),
