@@ -92,7 +92,7 @@ def test_behave_keypoints_and_masks_are_read(behave, tmp_path):
             expected = square(10 + t, 30) > 0
             assert (person.mask() != expected).sum() < 10  # a JPEG's rim
             assert np.array_equal(thing.mask(), square(100 + t, 20 + c) > 0)
-            assert thing.box.tolist() == [100 + t, 20, 20 + c, 20 + c]
+            assert thing.runs.box == (100 + t, 20, 20 + c, 20 + c)
 
 
 def nobody(folder: Path) -> None:
