@@ -11,6 +11,8 @@ import typer
 
 from intercap_core.cli.options import (
     Cores,
+    SequenceName,
+    Settings,
     SettingsOrDefault,
     open_project,
     prepare,
@@ -132,6 +134,62 @@ def check(settings: SettingsOrDefault) -> None:
     typer.echo(f"{settings}: {found.ready} of {found.sequences} sequences are ready to run")
     if found.faults:
         raise typer.Exit(1)
+
+
+@app.command()
+def calibrate(
+    settings: Settings,
+    sequence: SequenceName,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="File to write; default: column calibration of the sequence's row."),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOARD",
+            help="The board that the recordings show, lengths in metres: "
+            "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, checkerboard:COLUMNSxROWS:SQUARE "
+            "(inner corners) or aprilgrid:COLUMNSxROWS:TAG:GAP:DICTIONARY.",
+        ),
+    ] = None,
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(help="Further recordings of the rig, such as of a board; may repeat."),
+    ] = None,
+    lenses: Annotated[
+        Path | None,
+        typer.Option(help="Layout plain: calibration file with the lenses; poses are ignored."),
+    ] = None,
+    distance: Annotated[
+        str | None,
+        typer.Option(metavar="A:B:METRES", help="Measured distance between two cameras' lenses."),
+    ] = None,
+    master: Annotated[
+        str | None, typer.Option(help="The camera whose frame is the world; default: the first.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite an existing file.")] = False,
+) -> None:
+    """Find the poses of all cameras from a recording, without or with a board.
+
+    Uses everything that the recording shows: a person who walks through the views, surfaces
+    measured by depth, and a board. Cameras may have started at different moments. The scale follows
+    from depth, the board, --distance or the subject's height (table of subjects). Writes the
+    calibration and a page with a picture of the cameras; nothing is written if a camera cannot be
+    placed, and the message names what to record instead.
+
+    Examples: intercap calibrate lab/config.yaml walk_01;
+    intercap calibrate lab/config.yaml walk_01 --board charuco:8x6:0.06:0.045:4X4_50
+    --recordings ~/board; intercap calibrate lab/config.yaml walk_01 --distance k1:k2:2.35
+    """
+    project = open_project(settings, sequence)
+    from intercap_core.commands.calibrate import calibrate as run_calibration
+
+    path, page = run_calibration(
+        project, sequence, output=output, lenses=lenses, board=board,
+        recordings=recordings or [], distance=distance, master=master, replace=replace,
+    )  # fmt: skip
+    typer.echo(f"written: {path}\npicture and table: {page}")
 
 
 @app.command(

@@ -174,7 +174,7 @@ class BodyConstraint:
         by_point = by_camera @ colour_from_master[:, :3, :3]
         arm = seen - poses[:, :3, 3]
         # x_c = R' (X - t): turning R by w changes x_c by R' [X - t]x w, moving t by v by -R' v.
-        by_pose = np.concatenate([by_point @ _cross_matrix(arm), -by_point], -1)
+        by_pose = np.concatenate([by_point @ cross_matrix(arm), -by_point], -1)
         residual = pixels - self._views.pixels
         size = np.linalg.norm(residual, axis=-1)
         known = self._views.weights > 0
@@ -196,7 +196,7 @@ def _normal_of_points(
     return normal, np.einsum("ncij,nci->nj", weighted, residual)
 
 
-def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
+def cross_matrix(vectors: np.ndarray) -> np.ndarray:
     """[v]x (..., 3, 3) of vectors (..., 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)

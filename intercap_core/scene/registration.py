@@ -175,7 +175,12 @@ class Registration:
     """Estimates a rig from surfaces; the pose and time of the master are fixed."""
 
     def __init__(
-        self, rig: Rig, layers: Layers, master: int, offset_sigma: np.ndarray | None = None
+        self,
+        rig: Rig,
+        layers: Layers,
+        master: int,
+        offset_sigma: np.ndarray | None = None,
+        prior: tuple[float, float] = (PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M),
     ) -> None:
         """
         Args:
@@ -184,8 +189,10 @@ class Registration:
             master: index of the master.
             offset_sigma: (C,) prior standard deviation of the given offsets, seconds; None = 1 s,
                 practically no prior.
+            prior: standard deviations of the start's rotations, rad, and translations, metres.
         """
         self.rig = rig
+        self._prior = prior
         self._offset_sigma = np.ones(len(rig)) if offset_sigma is None else offset_sigma
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
@@ -358,8 +365,7 @@ class Registration:
     ) -> None:
         """Add the prior around ``start`` to the normal equations, in place."""
         precision = np.r_[
-            np.full(3, PRIOR_ROTATION_RAD**-2.0),
-            np.full(3, PRIOR_TRANSLATION_M**-2.0),
+            np.repeat(np.square(self._prior), 3) ** -1.0,
             # standard deviation of the depth bias, 3 mm: about a quarter of the largest systematic
             # error, 11 mm + 0.1 % of depth (Azure Kinect DK data sheet)
             0.003**-2.0,

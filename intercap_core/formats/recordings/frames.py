@@ -63,6 +63,12 @@ class Frames:
             )
         return Frames(self._artefact, image_of)
 
+    def at(self, rig: Rig) -> Frames:
+        """Return the same images with other lenses or poses of the cameras."""
+        frames = Frames(self._artefact, self._image_of)
+        frames.rig = rig
+        return frames
+
     @cached_property
     def rig(self) -> Rig:
         """Lenses and extrinsics of the calibration (unrefined)."""

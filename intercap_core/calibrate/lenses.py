@@ -1,0 +1,90 @@
+"""Lenses of cameras from the images of a board, by OpenCV's ``calibrateCamera``."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from intercap_core.calibrate.boards import Board
+from intercap_core.calibrate.evidence import CORNERS, Views
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+
+MIN_VIEWS = 12  # of the board: OpenCV's guide advises ten at least; half of them are held out
+MIN_COVERED = 0.5  # share of a 4 x 3 grid of the image that holds corners
+MIN_GAIN = 0.1  # by which held-out errors must fall before a stated lens is replaced
+
+
+def describe_coverage(views: Views, camera: int, size: tuple[int, int]) -> str:
+    """What the board's images lack for an estimate of the lens; "" = they suffice."""
+    pixels = views.pixels[:, camera, CORNERS]
+    seen = np.isfinite(pixels[..., 0])
+    count = int(seen.any(1).sum())
+    if count < MIN_VIEWS:
+        return f"the board is seen in {count} of its images, expected at least {MIN_VIEWS}"
+    cells = (pixels[seen] * (4, 3) / size).astype(int).clip(0, (3, 2))
+    covered = len(np.unique(cells, axis=0)) / 12
+    if covered < MIN_COVERED:
+        return (
+            f"the board was seen in {100 * covered:.0f} % of its image's area, expected at least "
+            f"{100 * MIN_COVERED:.0f} %: hold it near the corners of the image, too"
+        )
+    return ""
+
+
+def estimate_lens(
+    views: Views, camera: int, board: Board, start: Intrinsics, *, stated: bool
+) -> tuple[Intrinsics, str]:
+    """Estimate a lens with five coefficients of distortion.
+
+    Args:
+        start: the lens as stated, or a guess.
+        stated: keep ``start`` unless held-out images contradict it.
+
+    Returns:
+        The lens, and a note on the estimate; "" = ``start`` is kept for lack of images.
+    """
+    size = (start.width, start.height)
+    if describe_coverage(views, camera, size):
+        return start, ""
+    pixels = views.pixels[:, camera, CORNERS]
+    images = [
+        (board.corners[known].astype(np.float32), image[known].astype(np.float32))
+        for image in pixels
+        if (known := np.isfinite(image[:, 0])).any()
+    ]
+    lens = _calibrated(images, start)
+    if not stated:
+        return lens, f"its lens is estimated from {len(images)} images of the board"
+    half = _calibrated(images[::2], start)
+    before, after = (_error(images[1::2], lens) for lens in (start, half))
+    if after > (1 - MIN_GAIN) * before:
+        return start, f"its stated lens fits the board to {before:.2f} px and is kept"
+    return lens, f"its lens is refined: held-out corners {before:.2f} to {after:.2f} px"
+
+
+def _calibrated(images: list[tuple[np.ndarray, np.ndarray]], start: Intrinsics) -> Intrinsics:
+    points, pixels = zip(*images, strict=True)
+    _, matrix, coefficients, _, _ = cv2.calibrateCamera(
+        points, pixels, (start.width, start.height), start.matrix,
+        np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+    )  # fmt: skip
+    distortion = np.r_[coefficients.ravel()[:5], 0, 0, 0]
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    return Intrinsics(start.width, start.height, fx, fy, cx, cy, distortion, start.metric_radius)
+
+
+def _error(images: list[tuple[np.ndarray, np.ndarray]], lens: Intrinsics) -> float:
+    """Median reprojection error, px, at the best pose of each image."""
+    errors = []
+    for points, pixels in images:
+        rays = np.ascontiguousarray(lens.unproject(pixels.astype(float))[:, :2])
+        found, turn, shift = cv2.solvePnP(
+            points.astype(float), rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+        if found:
+            turn, shift = cv2.solvePnPRefineLM(
+                points.astype(float), rays, np.eye(3), None, turn, shift
+            )
+            seen = points @ cv2.Rodrigues(turn)[0].T + shift.ravel()
+            errors.append(np.linalg.norm(lens.project(seen) - pixels, axis=1))
+    return float(np.median(np.concatenate(errors))) if errors else np.inf

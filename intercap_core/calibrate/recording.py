@@ -1,0 +1,196 @@
+"""Frames and detections of recordings whose camera poses are not known yet.
+
+The stages read a calibration, so they get one with the cameras in a row, 1 m apart: neither frames
+nor detections depend on the poses.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.entries import SequenceEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.formats.calibration.opencv import load_opencv
+from intercap_core.formats.recordings import k4a, plain
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project
+
+_POSE_FIELDS = ("R", "T", "rvec", "tvec")
+_LENS_FIELDS = ("camera_matrix", "distortion_coefficients")
+
+
+@dataclass(frozen=True, eq=False)
+class RigDraft:
+    """What is known of the cameras before the calibration."""
+
+    names: tuple[str, ...]
+    """Names of the cameras by the recordings, the master first."""
+    content: dict[str, Any] | None
+    """Calibration in OpenCV's terms that the result completes; None for Azure Kinects."""
+    without_lens: frozenset[str]
+    """Cameras whose lens is not stated."""
+
+
+def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> RigDraft:
+    """Find the cameras of a row and their stated lenses.
+
+    Args:
+        lenses: calibration with lenses, with or without poses; None = ``calibration`` of the row if
+            that file exists.
+        master: name of the master; None = as the lenses' file states, else the first by name.
+    """
+    if not row.recordings.is_dir():
+        raise UserError(
+            f"{row.recordings}: sequence {row.sequence!r} has no such folder of recordings; "
+            "correct 'recordings' in the table of sequences"
+        )
+    if row.layout not in ("k4a", "plain"):
+        raise UserError(
+            f"sequence {row.sequence!r} has layout {row.layout}, whose release holds the cameras' "
+            "poses; expected layout k4a or plain"
+        )
+    finder = k4a.find_cameras if row.layout == "k4a" else plain.find_cameras
+    names = finder(row.recordings)
+    if not names:
+        raise UserError(
+            f"{row.recordings}: holds no recording of layout {row.layout}; correct 'recordings' or "
+            "'layout' in the table of sequences"
+        )
+    if row.layout == "k4a":
+        return RigDraft(_ordered(names, master, row.recordings), None, frozenset())
+    source = lenses or (row.calibration if row.calibration.exists() else None)
+    content = _read_lenses(source)
+    entries = {name: dict(content["cameras"].get(name) or {}) for name in names}
+    first = master or content.get("master")
+    names = list(_ordered(names, None if first is None else str(first), row.recordings))
+    for name, entry in entries.items():
+        for field in _POSE_FIELDS:
+            entry.pop(field, None)
+        if "image_size" not in entry and "image_width" not in entry:
+            entry["image_size"] = _image_size(row.recordings, name)
+    without = frozenset(n for n in names if any(f not in entries[n] for f in _LENS_FIELDS))
+    content |= {"master": names[0], "cameras": {name: entries[name] for name in names}}
+    return RigDraft(tuple(names), content, without)
+
+
+def _read_lenses(source: Path | None) -> dict[str, Any]:
+    """Content of a calibration file in OpenCV's terms, or of a folder with a file per camera."""
+    if source is None:
+        return {"cameras": {}}
+    if source.is_dir():
+        files = [
+            p for p in sorted(source.iterdir()) if p.suffix.lower() in (".json", ".yaml", ".yml")
+        ]
+        return {"cameras": {file.stem: load_opencv(file) for file in files}}
+    content = load_opencv(source)
+    if not isinstance(content.get("cameras"), dict):
+        raise UserError(
+            f"{source}: expected 'cameras' with a lens for each camera; docs/recordings.md shows one"
+        )
+    return dict(content)
+
+
+def _ordered(names: Sequence[str], master: str | None, folder: Path) -> tuple[str, ...]:
+    if master is not None and master not in names:
+        raise UserError(
+            f"{folder}: holds no camera {master!r}, which is to be the master; expected one of "
+            f"{', '.join(names)}"
+        )
+    first = master or names[0]
+    return (first, *(name for name in names if name != first))
+
+
+def _image_size(recordings: Path, name: str) -> list[int]:
+    from intercap_core.formats.recordings.image_files import find_size
+    from intercap_core.formats.recordings.video import read_video_size
+
+    images = plain.find_images(recordings).get(name)
+    videos = [
+        p
+        for p in recordings.iterdir()
+        if p.stem == name and p.suffix.lower() in plain.VIDEO_SUFFIXES
+    ]
+    size = find_size(images[:1]) if images else read_video_size(videos[0]) if videos else None
+    if size is None:
+        raise UserError(f"{recordings}: camera {name} has no readable image; expected one")
+    return list(size)
+
+
+def posed_content(draft: RigDraft, poses: np.ndarray) -> dict[str, Any]:
+    """The draft's calibration with poses (C, 4, 4) master_from_colour."""
+    assert draft.content is not None
+    entries = {}
+    for name, pose in zip(draft.names, poses, strict=True):
+        entry = dict(draft.content["cameras"][name])
+        if name in draft.without_lens and "camera_matrix" not in entry:
+            width, height = entry["image_size"]
+            focal = 0.9 * max(width, height)  # 58 degrees wide, until the board tells
+            matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
+            entry |= {"camera_matrix": matrix, "distortion_coefficients": [0.0] * 5}
+        rotation = pose[:3, :3].T
+        entry |= {"R": rotation.tolist(), "T": (-rotation @ pose[:3, 3]).tolist()}
+        entries[name] = entry
+    return draft.content | {"cameras": entries}
+
+
+def write_calibration(path: Path, draft: RigDraft, poses: np.ndarray) -> None:
+    """Write poses (C, 4, 4) as a rig file, or with the lenses as a file in OpenCV's terms."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if draft.content is None:
+        by_name = dict(zip(draft.names, poses, strict=True))
+        write_rig_file(path, Extrinsics(draft.names[0], by_name))
+    else:
+        path.write_text(json.dumps(posed_content(draft, poses), indent=1) + "\n", encoding="utf-8")
+
+
+def record(
+    project: Project, row: SequenceEntry, draft: RigDraft, folders: Sequence[Path]
+) -> list[tuple[Path, Path]]:
+    """Run stages ``frames`` and ``detections`` of the row and of further recordings of the rig.
+
+    Results are in ``calibrate`` of the project's results and are kept for the next run.
+
+    Args:
+        folders: further recordings with the same layout and cameras, without keypoints.
+
+    Returns:
+        Paths of both artefacts, of the row first.
+    """
+    places = project.results / "calibrate"
+    in_a_row = np.stack(
+        [rigid(np.eye(3), np.array([c, 0.0, 0.0])) for c in range(len(draft.names))]
+    )
+    start = places / row.sequence / "start.json"
+    write_calibration(start, draft, in_a_row)
+    rows = {
+        row.sequence: row.model_copy(
+            update={
+                "calibration": start,
+                "calibration_scale": None,
+                "calibration_up": None,
+                "calibration_floor": None,
+            }
+        )
+    }
+    for number, folder in enumerate(folders, 1):
+        name = f"{row.sequence}_{number}"
+        nothing = {"keypoints": None, "candidates": None, "annotation": None}
+        rows[name] = rows[row.sequence].model_copy(
+            update={"sequence": name, "recordings": folder, **nothing}
+        )
+    config = project.config.model_copy(update={"results": project.results, "dataset": "calibrate"})
+    own = replace(project, config=config, sequences=rows)
+    paths = []
+    for name in rows:
+        for stage in ("frames", "detections"):
+            run_step(stage, own, name, keep=True)
+        paths.append((own.artefact(name, "frames"), own.artefact(name, "detections")))
+    return paths

@@ -1,0 +1,148 @@
+"""`intercap calibrate`: camera poses of a rig from its recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from intercap_core.calibrate.boards import parse_board
+from intercap_core.calibrate.recording import RigDraft, draft_rig, record, write_calibration
+from intercap_core.calibrate.rig_poses import WEAK_M, FoundRig, find_poses
+from intercap_core.commands.console import ListTable, print_plain, standard_console
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.output.site.calibration_page import calibration_page
+from intercap_core.project import Project
+from intercap_core.scene.up import rough_up
+
+
+def calibrate(
+    project: Project,
+    sequence: str,
+    *,
+    output: Path | None,
+    lenses: Path | None,
+    board: str | None,
+    recordings: Sequence[Path],
+    distance: str | None,
+    master: str | None,
+    replace: bool,
+) -> tuple[Path, Path]:
+    """Find the poses, write them and a page, and print a summary.
+
+    Returns the paths of the calibration and of the page. Raises UserError as :func:`find_poses`,
+    and if the output exists.
+    """
+    project.require_sequence(sequence)
+    row = project.sequences[sequence]
+    path = output or row.calibration
+    if path.exists() and not replace:
+        raise UserError(
+            f"{path}: exists and is not replaced; name another file (--output), or give --replace"
+        )
+    parsed_board = None if board is None else parse_board(board)
+    parsed_distance = None if distance is None else _parse_distance(distance)
+    draft = draft_rig(row, lenses, master)
+    paths = record(project, row, draft, recordings)
+    found = find_poses(
+        paths,
+        board=parsed_board,
+        height_m=project.subjects[row.subject].height,
+        distance=parsed_distance,
+        without_lens=draft.without_lens,
+        keep_lenses=draft.content is None,
+    )
+    order = [found.rig.names.index(name) for name in draft.names]
+    write_calibration(path, _with_lenses(draft, found), found.rig.master_from_colour[order])
+    with Frames.open(paths[0][0]) as frames:
+        up = rough_up(found.rig, frames.gravity).direction
+    rows, advice = _rows(found), advise(found)
+    page = project.results / "calibrate" / sequence / "calibration.html"
+    page.write_text(calibration_page(sequence, found, up, rows, advice), encoding="utf-8")
+    _print(rows, found, advice)
+    return path, page
+
+
+def _parse_distance(text: str) -> tuple[str, str, float]:
+    names = text.split(":")
+    try:
+        first, second, metres = names[0], names[1], float(names[2])
+    except (IndexError, ValueError):
+        metres = 0.0
+    if not (metres > 0 and len(names) == 3):
+        raise UserError(
+            f"--distance {text!r}: expected CAMERA:CAMERA:METRES, for example k1:k2:2.35"
+        )
+    return first, second, metres
+
+
+def _with_lenses(draft: RigDraft, found: FoundRig) -> RigDraft:
+    """The draft with estimated lenses."""
+    if draft.content is None or not found.new_lenses:
+        return draft
+    entries = dict(draft.content["cameras"])
+    for name, lens in found.new_lenses.items():
+        entries[name] = entries[name] | {
+            "camera_matrix": lens.matrix.tolist(),
+            "distortion_coefficients": lens.distortion[:5].tolist(),
+        }
+    return RigDraft(draft.names, draft.content | {"cameras": entries}, frozenset())
+
+
+def _rows(found: FoundRig) -> list[dict[str, str]]:
+    """Table of the cameras."""
+
+    def number(value: float) -> str:
+        return "–" if np.isnan(value) else f"{value:.1f}"
+
+    return [
+        {
+            "name": name,
+            "sigma": "reference" if c == 0 else f"{1e3 * found.sigma_m(c):.1f}",
+            "joints": str(found.joints[c]),
+            "joint_error": number(found.joint_error_px[c]),
+            "boards": str(found.boards[c] or ""),
+            "corner_error": number(found.corner_error_px[c]),
+            "lag": str(found.lags[c] or ""),
+        }
+        for c, name in enumerate(found.rig.names)
+    ]
+
+
+def advise(found: FoundRig) -> list[str]:
+    """Notes, and for each weak camera where to walk or to hold the board."""
+    advice = list(found.notes)
+    names, poses = found.rig.names, found.rig.master_from_colour
+    for c in range(1, len(names)):
+        if found.sigma_m(c) <= WEAK_M:
+            continue
+        # the camera whose view makes the largest useful angle with this one's
+        cosine = poses[:, :3, 2] @ poses[c, :3, 2]
+        partner = int(np.argmin(np.abs(np.where(np.arange(len(names)) == c, np.inf, cosine - 0.3))))
+        advice.append(
+            f"{names[c]} is known to {1e3 * found.sigma_m(c):.0f} mm only: walk to and fro where "
+            f"{names[c]} and {names[partner]} both see the whole body, at several distances, or "
+            "hold a board where both see it"
+        )
+    return advice
+
+
+def _print(rows: list[dict[str, str]], found: FoundRig, advice: list[str]) -> None:
+    console = standard_console()
+    table = ListTable(
+        "camera",
+        "estimated error, mm",
+        "joints",
+        "error, px",
+        "boards",
+        "error, px",
+        "late, frames",
+    )
+    for row in rows:
+        table.add_row(*row.values())
+    console.print(table)
+    print_plain(console, f"scale by {found.scale}")
+    for line in advice:
+        print_plain(console, line)
