@@ -102,7 +102,8 @@ class JointTerm:
         """
         for _ in range(2):
             self._adapt(poses)
-        return self._reduced(poses)[:2]
+        matrix, gradient, *_ = self._reduced(poses)
+        return matrix, gradient
 
     def errors_px(self, poses: np.ndarray) -> np.ndarray:
         """Median reprojection error (C,) of each camera, pixels of a 1080p image; NaN = none."""
@@ -178,15 +179,8 @@ class JointTerm:
         reduced = matrix[:size, :size] - matrix[:size, size:] @ both[:, :-1]
         pull = gradient[:size] - matrix[:size, size:] @ both[:, -1]
         shape = (views, 6, views, 6)
-        return (
-            reduced.reshape(shape),
-            pull.reshape(views, 6),
-            insets,
-            gradient[size:],
-            with_inset,
-            own,
-            slope,
-        )
+        pull = pull.reshape(views, 6)
+        return reduced.reshape(shape), pull, insets, gradient[size:], with_inset, own, slope
 
 
 class BoardTerm:

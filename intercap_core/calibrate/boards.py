@@ -116,7 +116,7 @@ def _charuco(
 ) -> Board:
     if lengths[1] >= lengths[0]:
         raise UserError(f"--board {text!r}: the marker must be smaller than the square")
-    board = cv2.aruco.CharucoBoard((columns, rows), *lengths, dictionary)
+    board = cv2.aruco.CharucoBoard((columns, rows), lengths[0], lengths[1], dictionary)
     detector = cv2.aruco.CharucoDetector(board)
 
     def find(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +133,7 @@ def _charuco(
 def _april_grid(
     columns: int, rows: int, lengths: list[float], dictionary: cv2.aruco.Dictionary
 ) -> Board:
-    board = cv2.aruco.GridBoard((columns, rows), *lengths, dictionary)
+    board = cv2.aruco.GridBoard((columns, rows), lengths[0], lengths[1], dictionary)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)

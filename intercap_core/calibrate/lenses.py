@@ -77,14 +77,11 @@ def _error(images: list[tuple[np.ndarray, np.ndarray]], lens: Intrinsics) -> flo
     """Median reprojection error, px, at the best pose of each image."""
     errors = []
     for points, pixels in images:
-        rays = np.ascontiguousarray(lens.unproject(pixels.astype(float))[:, :2])
-        found, turn, shift = cv2.solvePnP(
-            points.astype(float), rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
+        seen = np.ascontiguousarray(lens.unproject(pixels.astype(float))[:, :2]), np.eye(3), None
+        place = points.astype(float)
+        found, turn, shift = cv2.solvePnP(place, *seen, flags=cv2.SOLVEPNP_IPPE)
         if found:
-            turn, shift = cv2.solvePnPRefineLM(
-                points.astype(float), rays, np.eye(3), None, turn, shift
-            )
-            seen = points @ cv2.Rodrigues(turn)[0].T + shift.ravel()
-            errors.append(np.linalg.norm(lens.project(seen) - pixels, axis=1))
+            turn, shift = cv2.solvePnPRefineLM(place, *seen, turn, shift)
+            moved = points @ cv2.Rodrigues(turn)[0].T + shift.ravel()
+            errors.append(np.linalg.norm(lens.project(moved) - pixels, axis=1))
     return float(np.median(np.concatenate(errors))) if errors else np.inf

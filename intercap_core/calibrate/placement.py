@@ -25,12 +25,12 @@ from intercap_core.calibrate.evidence import CORNERS, JOINTS, NUM_JOINTS, Views
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.camera.triangulation import triangulate
-from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 
 # Reprojection error of an inlier, pixels of a 1080p image. Lifted joints are 3 cm off, which is
 # 12 px at 2.5 m from another side; twice that and the detector's error.
 MAX_ERROR_PX = 30.0
 MIN_POINTS = 60  # reference points of a camera, as body joints of more than two sets
+MIN_GAIN = 0.02  # of the cost by which a lag is better than none; a set of a walk costs 0.1
 MIN_SHARE = 0.4  # of inliers; wrong poses agree with less than a quarter
 FIRST_DISTANCE_M = 2.5  # assumed median distance of joints while the scale is unknown
 _SOUGHT = 400  # reference points with which lags are searched
@@ -100,12 +100,7 @@ def _clearest(costs: dict[int, float]) -> int:
     if not costs:
         return 0
     best = min(costs, key=lambda lag: (costs[lag], abs(lag)))
-    spread = (
-        SIGMA_PER_MAD * float(np.median(np.abs(np.diff(list(costs.values())))))
-        if len(costs) > 1
-        else 0.0
-    )
-    return best if costs[best] < costs.get(0, np.inf) - max(0.02, spread) else 0
+    return best if costs[best] < costs.get(0, np.inf) - MIN_GAIN else 0
 
 
 def _shifted(values: np.ndarray, lag: int) -> np.ndarray:
@@ -153,7 +148,7 @@ def reference_points(
     rig: Rig, views: Views, placed: Sequence[int], board: Board | None
 ) -> np.ndarray:
     """Points (T, M, 3) that the ``placed`` cameras know, master frame, metres; NaN = unknown."""
-    result = np.full((*views.pixels.shape[::2][:1], views.pixels.shape[2], 3), np.nan)
+    result = np.full((len(views.times), views.pixels.shape[2], 3), np.nan)
     result[:, JOINTS] = _joints(rig, views, placed)
     if board is not None:
         poses = board_poses(rig, views, placed, board)
@@ -176,12 +171,12 @@ def _joints(rig: Rig, views: Views, placed: Sequence[int]) -> np.ndarray:
     some = known.any(0)
     result[some] = np.nanmedian(lifted[:, some], axis=0)
     if len(placed) > 1:
-        pixels = np.swapaxes(views.pixels[:, placed][:, :, JOINTS], 1, 2).reshape(
-            -1, len(placed), 2
+        pixels, weights = (
+            np.swapaxes(values[:, placed][:, :, JOINTS], 1, 2)
+            for values in (np.nan_to_num(views.pixels), views.confidence)
         )
-        weights = np.swapaxes(views.confidence[:, placed][:, :, JOINTS], 1, 2)
         points = triangulate(
-            np.nan_to_num(pixels), weights.reshape(-1, len(placed)),
+            pixels.reshape(-1, len(placed), 2), weights.reshape(-1, len(placed)),
             Rig(tuple(rig[c] for c in placed)), max_error_px=MAX_ERROR_PX,
         ).points.reshape(result.shape)  # fmt: skip
         agreed = np.isfinite(points[..., 0])
@@ -273,13 +268,8 @@ def _essential(
     away = np.linalg.norm(place, axis=1)
     sine = np.linalg.norm(np.cross(place, to_second), axis=1)
     sine /= away * np.linalg.norm(to_second, axis=1)
-    return (
-        rigid(turn, shift.ravel()),
-        float(np.median(sine)),
-        count / len(a),
-        len(a),
-        float(np.median(away)),
-    )
+    pose, far = rigid(turn, shift.ravel()), float(np.median(away))
+    return pose, float(np.median(sine)), count / len(a), len(a), far
 
 
 def place_all(

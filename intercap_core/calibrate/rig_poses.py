@@ -380,9 +380,8 @@ def _rescale(
     if distance is not None:
         for name in distance[:2]:
             if name not in names:
-                raise UserError(
-                    f"--distance names camera {name!r}; expected one of {', '.join(names)}"
-                )
+                known = ", ".join(names)
+                raise UserError(f"--distance names camera {name!r}; expected one of {known}")
         a, b = (rig.master_from_colour[names.index(name), :3, 3] for name in distance[:2])
         scale, sigma = distance[2] / float(np.linalg.norm(a - b)), 0.005 / distance[2]  # 5 mm
         found.scale = f"the stated distance between {distance[0]} and {distance[1]}"
@@ -398,8 +397,8 @@ def _rescale(
         found.scale = f"the subject's height ({stated})"
         if not height_m:
             found.notes.append(
-                f"the scale is known to {100 * sigma:.0f} % only: state the subject's height in the "
-                "table of subjects, or the distance of two cameras (--distance)"
+                f"the scale is known to {100 * sigma:.0f} % only: state the subject's height in "
+                "the table of subjects, or the distance of two cameras (--distance)"
             )
     poses = rig.master_from_colour.copy()
     poses[:, :3, 3] *= scale
@@ -414,7 +413,7 @@ def _rescale(
 
 def _check_walk(found: FoundRig) -> None:
     """Raise UserError if the poses rest on a person who stands still."""
-    known = found.walk[np.isfinite(found.walk[:, 0])]
+    known: np.ndarray = found.walk[np.isfinite(found.walk[:, 0])]
     if found.boards.any() or len(known) < 2:
         return
     low, high = np.quantile(known, (0.02, 0.98), axis=0)
@@ -453,7 +452,7 @@ def _check_gravity(rig: Rig, gravity: np.ndarray) -> None:
     worst = int(off.argmax())
     if off[worst] > MAX_GRAVITY_DEG:
         raise UserError(
-            f"camera {rig.names[measured[worst]]}: its gravity sensor contradicts its found pose by "
-            f"{off[worst]:.0f} degrees, expected at most {MAX_GRAVITY_DEG:g}; record a longer walk "
-            "in the common view, or show a board. Nothing was written"
+            f"camera {rig.names[measured[worst]]}: its gravity sensor contradicts its found pose "
+            f"by {off[worst]:.0f} degrees, expected at most {MAX_GRAVITY_DEG:g}; record a longer "
+            "walk in the common view, or show a board. Nothing was written"
         )

@@ -28,7 +28,7 @@ def scale_by_height(joints: np.ndarray, height_m: float | None) -> tuple[float, 
     Segments of the limbs are compared with those of the open body, scaled to the height.
     ``height_m`` None = unknown. NaN if no segment is known.
     """
-    body = load_body_file(num_betas=0, num_expression=0)
+    body = load_body_file(None, num_betas=0, num_expression=0)
     rest = body.joint_regressor @ body.template
     stature = float(np.ptp(body.template[:, 1]))
     ratios = []

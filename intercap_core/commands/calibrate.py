@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core.calibrate.boards import parse_board
-from intercap_core.calibrate.recording import RigDraft, draft_rig, record, write_calibration
+from intercap_core.calibrate.draft import RigDraft, draft_rig, write_calibration
 from intercap_core.calibrate.rig_poses import WEAK_M, FoundRig, find_poses
 from intercap_core.commands.console import ListTable, print_plain, standard_console
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.output.site.calibration_page import calibration_page
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
 from intercap_core.scene.up import rough_up
 
@@ -45,7 +48,7 @@ def calibrate(
     parsed_board = None if board is None else parse_board(board)
     parsed_distance = None if distance is None else _parse_distance(distance)
     draft = draft_rig(row, lenses, master)
-    paths = record(project, row, draft, recordings)
+    paths = _record(project, row, draft, recordings)
     found = find_poses(
         paths,
         board=parsed_board,
@@ -63,6 +66,44 @@ def calibrate(
     page.write_text(calibration_page(sequence, found, up, rows, advice), encoding="utf-8")
     _print(rows, found, advice)
     return path, page
+
+
+def _record(
+    project: Project, row: SequenceEntry, draft: RigDraft, folders: Sequence[Path]
+) -> list[tuple[Path, Path]]:
+    """Run stages ``frames`` and ``detections`` of the row and of further recordings of the rig.
+
+    The stages read a calibration, so they get one with the cameras in a row, 1 m apart: neither
+    frames nor detections depend on the poses. Results are in ``calibrate`` of the project's results
+    and are kept for the next run.
+
+    Args:
+        folders: further recordings with the same layout and cameras, without keypoints.
+
+    Returns:
+        Paths of both artefacts, of the row first.
+    """
+    places = project.results / "calibrate"
+    in_a_row = np.tile(np.eye(4), (len(draft.names), 1, 1))
+    in_a_row[:, 0, 3] = np.arange(len(draft.names))
+    start = places / row.sequence / "start.json"
+    write_calibration(start, draft, in_a_row)
+    unused = dict.fromkeys(("calibration_scale", "calibration_up", "calibration_floor"))
+    rows = {row.sequence: row.model_copy(update={"calibration": start, **unused})}
+    for number, folder in enumerate(folders, 1):
+        name = f"{row.sequence}_{number}"
+        nothing = dict.fromkeys(("keypoints", "candidates", "annotation"))
+        rows[name] = rows[row.sequence].model_copy(
+            update={"sequence": name, "recordings": folder, **nothing}
+        )
+    config = project.config.model_copy(update={"results": project.results, "dataset": "calibrate"})
+    own = dataclasses.replace(project, config=config, sequences=rows)
+    paths = []
+    for name in rows:
+        for stage in ("frames", "detections"):
+            run_step(stage, own, name, keep=True)
+        paths.append((own.artefact(name, "frames"), own.artefact(name, "detections")))
+    return paths
 
 
 def _parse_distance(text: str) -> tuple[str, str, float]:

@@ -1,14 +1,10 @@
-"""Frames and detections of recordings whose camera poses are not known yet.
-
-The stages read a calibration, so they get one with the cameras in a row, 1 m apart: neither frames
-nor detections depend on the poses.
-"""
+"""What a row states of the cameras of a rig, and the calibration file that is made of it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +15,6 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.opencv import load_opencv
 from intercap_core.formats.recordings import k4a, plain
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.pipeline.step import run_step
-from intercap_core.project import Project
 
 _POSE_FIELDS = ("R", "T", "rvec", "tvec")
 _LENS_FIELDS = ("camera_matrix", "distortion_coefficients")
@@ -86,14 +79,13 @@ def _read_lenses(source: Path | None) -> dict[str, Any]:
     if source is None:
         return {"cameras": {}}
     if source.is_dir():
-        files = [
-            p for p in sorted(source.iterdir()) if p.suffix.lower() in (".json", ".yaml", ".yml")
-        ]
+        suffixes = (".json", ".yaml", ".yml")
+        files = [path for path in sorted(source.iterdir()) if path.suffix.lower() in suffixes]
         return {"cameras": {file.stem: load_opencv(file) for file in files}}
     content = load_opencv(source)
     if not isinstance(content.get("cameras"), dict):
         raise UserError(
-            f"{source}: expected 'cameras' with a lens for each camera; docs/recordings.md shows one"
+            f"{source}: expected 'cameras' with a lens for each; docs/recordings.md shows one"
         )
     return dict(content)
 
@@ -113,12 +105,10 @@ def _image_size(recordings: Path, name: str) -> list[int]:
     from intercap_core.formats.recordings.video import read_video_size
 
     images = plain.find_images(recordings).get(name)
-    videos = [
-        p
-        for p in recordings.iterdir()
-        if p.stem == name and p.suffix.lower() in plain.VIDEO_SUFFIXES
-    ]
-    size = find_size(images[:1]) if images else read_video_size(videos[0]) if videos else None
+    size = find_size(images[:1]) if images else None
+    for path in recordings.iterdir():
+        if path.stem == name and path.suffix.lower() in plain.VIDEO_SUFFIXES:
+            size = size or read_video_size(path)
     if size is None:
         raise UserError(f"{recordings}: camera {name} has no readable image; expected one")
     return list(size)
@@ -149,48 +139,3 @@ def write_calibration(path: Path, draft: RigDraft, poses: np.ndarray) -> None:
         write_rig_file(path, Extrinsics(draft.names[0], by_name))
     else:
         path.write_text(json.dumps(posed_content(draft, poses), indent=1) + "\n", encoding="utf-8")
-
-
-def record(
-    project: Project, row: SequenceEntry, draft: RigDraft, folders: Sequence[Path]
-) -> list[tuple[Path, Path]]:
-    """Run stages ``frames`` and ``detections`` of the row and of further recordings of the rig.
-
-    Results are in ``calibrate`` of the project's results and are kept for the next run.
-
-    Args:
-        folders: further recordings with the same layout and cameras, without keypoints.
-
-    Returns:
-        Paths of both artefacts, of the row first.
-    """
-    places = project.results / "calibrate"
-    in_a_row = np.stack(
-        [rigid(np.eye(3), np.array([c, 0.0, 0.0])) for c in range(len(draft.names))]
-    )
-    start = places / row.sequence / "start.json"
-    write_calibration(start, draft, in_a_row)
-    rows = {
-        row.sequence: row.model_copy(
-            update={
-                "calibration": start,
-                "calibration_scale": None,
-                "calibration_up": None,
-                "calibration_floor": None,
-            }
-        )
-    }
-    for number, folder in enumerate(folders, 1):
-        name = f"{row.sequence}_{number}"
-        nothing = {"keypoints": None, "candidates": None, "annotation": None}
-        rows[name] = rows[row.sequence].model_copy(
-            update={"sequence": name, "recordings": folder, **nothing}
-        )
-    config = project.config.model_copy(update={"results": project.results, "dataset": "calibrate"})
-    own = replace(project, config=config, sequences=rows)
-    paths = []
-    for name in rows:
-        for stage in ("frames", "detections"):
-            run_step(stage, own, name, keep=True)
-        paths.append((own.artefact(name, "frames"), own.artefact(name, "detections")))
-    return paths
