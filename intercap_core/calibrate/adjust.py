@@ -26,7 +26,9 @@ from intercap_core.scene.registration import Constraint
 JOINT_PX = 3.0  # smallest error assumed of a joint, pixels of a 1080p image, as in stage `scene`
 DISTANCE_M = 0.03  # error of a lifted joint: relief of skin and clothes, and the sensor
 INSET_M = 0.02
-CORNER_PX = 0.3  # smallest error of a board's corner: refinement, blur, lens; of a 1080p image
+# Error of a board's corner, pixels of a 1080p image: mostly that of the lens, which neighbouring
+# corners share, so that the corners of an image count as four.
+CORNER_PX, CORNERS_OF_IMAGE = 0.5, 4.0
 MAX_SETS = 300  # with joints; more add nothing but time
 
 
@@ -227,7 +229,10 @@ class BoardTerm:
         """Matrix and gradient of the poses; coupling, matrix and slope of each board's pose."""
         views, boards = len(self._rig), len(self.boards)
         arms, pixel = self._corner_pixels(poses)
-        weight = pixel.weights(CORNER_PX)
+        of_image = pixel.known.reshape(boards, -1, views).sum(1, keepdims=True)
+        share = np.minimum(1.0, CORNERS_OF_IMAGE / np.maximum(of_image, 1))
+        share = np.broadcast_to(share, (boards, len(self._corners), views))
+        weight = share.reshape(-1, views) * pixel.weights(CORNER_PX)
         by_board = np.concatenate(
             [-pixel.by_point @ cross_matrix(arms.reshape(-1, 1, 3)), pixel.by_point], -1
         )

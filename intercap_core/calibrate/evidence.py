@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.calibrate.boards import Board
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
@@ -70,6 +71,17 @@ class Views:
         return cls(recording=numbers, **joined)
 
 
+class Nobody:
+    """People of a recording in which nobody is detected."""
+
+    def __init__(self, num_sets: int) -> None:
+        self.num_sets = num_sets
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """No keypoints (0, 135, 3)."""
+        return np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
+
+
 def find_views(frames: Frames, people: PeopleOfImages, rig: Rig, board: Board | None) -> Views:
     """The person who is largest in each image, and the board; distances of some sets."""
     sets, views = frames.num_sets, len(rig)
@@ -77,7 +89,7 @@ def find_views(frames: Frames, people: PeopleOfImages, rig: Rig, board: Board | 
     pixels = np.full((sets, views, count, 2), np.nan)
     confidence = np.zeros((sets, views, count))
     distance = np.full((sets, views, count), np.nan)
-    lifted, sought = (max(1, round(frames.fps / rate)) for rate in (LIFTED_PER_S, BOARDS_PER_S))
+    lifted, sought = (_some(frames.time_s, rate) for rate in (LIFTED_PER_S, BOARDS_PER_S))
     inset = np.concatenate([INSETS_M[BODY_POINTS], np.zeros(count - NUM_JOINTS)])
     for t in range(sets):
         for c, camera in enumerate(rig):
@@ -86,15 +98,21 @@ def find_views(frames: Frames, people: PeopleOfImages, rig: Rig, board: Board | 
                 seen = body[:, 2] >= MIN_CONFIDENCE
                 pixels[t, c, JOINTS][seen] = body[seen, :2]
                 confidence[t, c, JOINTS][seen] = body[seen, 2]
-            image = frames.colour(t, c) if board is not None and t % sought == 0 else None
+            image = frames.colour(t, c) if board is not None and sought[t] else None
             if board is not None and image is not None:
                 corners = board.locate(image)
                 pixels[t, c, CORNERS] = corners
                 confidence[t, c, CORNERS] = np.isfinite(corners[:, 0])
             with_board = confidence[t, c, CORNERS].any()
-            if camera.depth is not None and (with_board or t % lifted == 0):
+            if camera.depth is not None and (with_board or lifted[t]):
                 distance[t, c] = _distances(frames.depth(t, c), camera, pixels[t, c], inset)
     return Views(frames.time_s, np.zeros(sets, int), pixels, confidence, distance)
+
+
+def _some(times: np.ndarray, rate: float) -> np.ndarray:
+    """Mask (T,) of at most ``rate`` sets a second."""
+    slots = np.floor((times - times[0]) * rate + 1e-6)
+    return np.r_[True, np.diff(slots) > 0]
 
 
 def _distances(

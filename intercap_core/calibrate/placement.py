@@ -65,15 +65,22 @@ def first_camera(views: Views) -> int | None:
 
 
 def place(
-    rig: Rig, views: Views, camera: int, reference: np.ndarray, max_lag: int
+    rig: Rig,
+    views: Views,
+    camera: int,
+    placed: Sequence[int],
+    reference: np.ndarray,
+    max_lag: int,
 ) -> Placement | None:
     """Place one camera; None if it sees too few reference points or no pose fits any.
 
     Args:
-        reference: (T, M, 3) points in the frame of the placed cameras, metres; NaN = unknown.
+        placed: the cameras that are placed.
+        reference: (T, M, 3) points in their frame, metres; NaN = unknown.
         max_lag: largest lag that is tried, sets.
     """
     lags: dict[int, int] = {}
+    unknown = []  # recordings without reference points
     for recording in np.unique(views.recording).tolist():
         rows = views.recording == recording
         known, pixels = reference[rows], views.pixels[rows, camera]
@@ -83,13 +90,44 @@ def place(
             if found is not None and found[3] >= MIN_POINTS:
                 costs[lag] = found[1]
         lags[recording] = _clearest(costs)
+        unknown += [] if costs else [recording]
     for recording, lag in lags.items():
         views = views.late(camera, recording, lag) if lag else views
     found = _solve(rig[camera], reference, views.pixels[:, camera], None)
     if found is None:
         return None
     pose, _, share, points = found
+    poses = rig.master_from_colour.copy()
+    poses[camera] = invert(pose)
+    for recording in unknown if max_lag else ():
+        rows = views.recording == recording
+        cameras = [*placed, camera]
+        lags[recording] = _lag_of_rays(rig.moved(poses), views.subset(rows), cameras, max_lag)
     return Placement(camera, pose, lags, share, points)
+
+
+def _lag_of_rays(rig: Rig, views: Views, cameras: Sequence[int], max_lag: int) -> int:
+    """Lag of the last of the ``cameras`` at which its rays to joints meet those of the others."""
+    limit, some = MAX_ERROR_PX, Rig(tuple(rig[c] for c in cameras))
+    costs = {}
+    for lag in range(-max_lag, max_lag + 1):
+        moved = views.late(cameras[-1], int(views.recording[0]), lag)
+        seen = (moved.confidence[:, cameras][:, :, JOINTS] > 0).all(1)
+        t, k = np.nonzero(seen)
+        if len(t) < MIN_POINTS:
+            continue
+        rows = np.linspace(0, len(t) - 1, min(_SOUGHT, len(t))).astype(int)
+        t, k = t[rows], k[rows]
+        pixels, weights = (
+            v[t][:, cameras][np.arange(len(t)), :, k] for v in (moved.pixels, moved.confidence)
+        )
+        points = triangulate(
+            pixels, weights, Rig(tuple(rig[c] for c in cameras)), max_error_px=limit
+        )
+        error = np.nan_to_num(points.error, nan=limit) / limit
+        error[~points.inlier[:, -1]] = 1.0
+        costs[lag] = float((np.minimum(error, 1.0) ** 2).mean())
+    return _clearest(costs)
 
 
 def _clearest(costs: dict[int, float]) -> int:
@@ -303,7 +341,7 @@ def place_all(
     while True:
         reference = reference_points(rig, views, placed, board)
         waiting = [c for c in range(len(rig)) if c not in placed]
-        options = [o for c in waiting if (o := place(rig, views, c, reference, max_lag))]
+        options = [o for c in waiting if (o := place(rig, views, c, placed, reference, max_lag))]
         fitting = [option for option in options if option.fits]
         if not fitting:
             return rig, views, placed, options

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.scene.background import camera_background
 from intercap_core.scene.constraints import BodyConstraint, body_views
@@ -40,7 +40,7 @@ class Refined:
 
 
 def refine_on_surfaces(
-    frames: Frames, people: Detections, master: int, terms: Sequence[Constraint]
+    frames: Frames, people: PeopleOfImages, master: int, terms: Sequence[Constraint]
 ) -> Refined | None:
     """Refine the poses of the cameras of ``frames`` on surfaces, joints and further ``terms``.
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
     MIN_SEEN,
+    Nobody,
     Views,
     find_views,
 )
-from intercap_core.calibrate.lenses import describe_coverage, estimate_lens
+from intercap_core.calibrate.lenses import LensEstimate, describe_coverage, estimate_lens
 from intercap_core.calibrate.placement import (
     Placement,
     board_pose,
@@ -31,9 +33,8 @@ from intercap_core.calibrate.placement import (
 from intercap_core.calibrate.refine import refine_on_surfaces
 from intercap_core.calibrate.scale import scale_by_height
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.read import Detections
+from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.scene.camera_verdicts import weakest_motion
@@ -45,6 +46,10 @@ log = logging.getLogger(__name__)
 MIN_WALK_M = 0.4  # extent of the person's way; less moves every joint within its detector's errors
 WEAK_M = 0.03  # standard deviation at the rig's centre from which a camera is called weak
 MAX_GRAVITY_DEG = 5.0  # between gravity sensors; one of a Kinect is within a degree
+# Relative error of the scale that depth cameras share: the systematic error of an Azure Kinect is
+# at most 11 mm + 0.1 % of the depth (data sheet), taken as two standard deviations; mean of six
+# cameras at 2.5 m.
+DEPTH_SCALE_SIGMA = 0.0015
 MAX_BOARD_FACTOR = 0.05  # by which a board's size may contradict the depth
 
 
@@ -85,7 +90,7 @@ class FoundRig:
     scale: str
     """What determines the scale."""
     notes: list[str] = field(default_factory=list)
-    new_lenses: dict[str, Intrinsics] = field(default_factory=dict)
+    new_lenses: dict[str, LensEstimate] = field(default_factory=dict)
     """Estimated or refined lenses by camera."""
 
     def sigma_m(self, camera: int) -> float:
@@ -96,7 +101,7 @@ class FoundRig:
 
 
 def find_poses(
-    recordings: Sequence[tuple[Path, Path]],
+    recordings: Sequence[tuple[Path, Path | None]],
     *,
     board: Board | None,
     height_m: float | None,
@@ -109,8 +114,8 @@ def find_poses(
     Raises UserError, with what to record instead, if the recordings do not determine all poses.
 
     Args:
-        recordings: frames and detections artefacts of recordings of the rig; the first is used for
-            surfaces.
+        recordings: frames and detections artefacts of recordings of the rig, None = nobody is
+            detected; the first is used for surfaces.
         height_m: height of the subject, None = unknown; used if nothing else gives the scale.
         distance: two cameras and the metres between their lenses; overrides all other scales.
         without_lens: cameras whose lens is a guess, to be estimated from the board.
@@ -118,7 +123,10 @@ def find_poses(
     """
     with ExitStack() as stack:
         opened = [stack.enter_context(Frames.open(frames)) for frames, _ in recordings]
-        people = [Detections.load(path) for _, path in recordings]
+        people: list[PeopleOfImages] = [
+            Nobody(frames.num_sets) if path is None else Detections.load(path)
+            for frames, (_, path) in zip(opened, recordings, strict=True)
+        ]
         rig = opened[0].rig
         _require_images(opened)
         log.info("looking for people%s", " and the board" if board else "")
@@ -133,6 +141,7 @@ def find_poses(
         found = _place(rig, views, board, max(1, round(MAX_DELAY_S * opened[0].fps)))
         found.notes += notes
         found.new_lenses = new_lenses
+        _add_lens_errors(found)
         metric = first_camera(views) is not None
         found.scale = "depth" if metric else ""
         if metric and board is not None and found.boards.any():
@@ -191,7 +200,7 @@ def _lenses(
     without: frozenset[str],
     keep: bool,
     notes: list[str],
-) -> tuple[Rig, dict[str, Intrinsics]]:
+) -> tuple[Rig, dict[str, LensEstimate]]:
     """The rig with lenses estimated from the board, and those that are new."""
     cameras, new = list(rig), {}
     for c, camera in enumerate(rig):
@@ -206,13 +215,33 @@ def _lenses(
             )
         if board is None or lacks or (stated and keep):
             continue
-        lens, note = estimate_lens(views, c, board, camera.colour, stated=stated)
-        notes += [f"{camera.name}: {note}"] if note else []
-        if lens is not camera.colour:
-            new[camera.name] = lens
-            depth = lens if camera.aligned else camera.depth
-            cameras[c] = replace(camera, colour=lens, depth=depth)
+        estimate = estimate_lens(views, c, board, camera.colour, stated=stated)
+        notes += [f"{camera.name}: {estimate.note}"] if estimate.note else []
+        if estimate.lens is not camera.colour:
+            new[camera.name] = estimate
+            depth = estimate.lens if camera.aligned else camera.depth
+            cameras[c] = replace(camera, colour=estimate.lens, depth=depth)
     return Rig(tuple(cameras)), new
+
+
+def _add_lens_errors(found: FoundRig) -> None:
+    """Add the errors of estimated lenses to the covariance, in place.
+
+    A wrong focal length moves the camera along its view, a wrong principal point turns it. The
+    master's errors move all others.
+    """
+    centre = ring_centre(found.rig)
+    for c, camera in enumerate(found.rig):
+        lens = found.new_lenses.get(camera.name)
+        if lens is None:
+            continue
+        pose = camera.master_from_colour
+        along = lens.focal_sigma * float(np.linalg.norm(centre - pose[:3, 3]))
+        own = np.zeros((6, 6))
+        own[:3, :3] = lens.centre_sigma**2 * np.eye(3)
+        own[3:, 3:] = along**2 * np.outer(pose[:3, 2], pose[:3, 2])
+        for other in range(1, len(found.rig)) if c == 0 else (c,):
+            found.covariance[other, :, other] += own
 
 
 def _check_board_size(rig: Rig, views: Views, board: Board) -> None:
@@ -359,13 +388,13 @@ def _pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
     boards = (views.confidence[:, :, CORNERS] > 0).any(2)
     sizes = joints.sizes_px(rig.master_from_colour)
     pairs = []
-    for a in range(len(rig)):
-        for b in range(a + 1, len(rig)):
-            both = np.isfinite(sizes[:, a]) & np.isfinite(sizes[:, b])
-            error = np.median(sizes[both][:, [a, b]]) if both.any() else np.nan
-            common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
-            if any(common):
-                pairs.append(Pair((a, b), *common, float(error)))
+    for a, b in combinations(range(len(rig)), 2):
+        own = sizes[:, [a, b]]
+        own = own[np.isfinite(own.sum(1))]
+        error = float(np.median(own)) if len(own) else np.nan
+        common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
+        if any(common):
+            pairs.append(Pair((a, b), *common, error))
     return pairs
 
 
@@ -405,10 +434,24 @@ def _rescale(
     covariance = found.covariance.copy()
     covariance[:, 3:] *= scale
     covariance[:, :, :, 3:] *= scale
-    shift = np.zeros((len(rig), 6))
-    shift[:, 3:] = sigma * poses[:, :3, 3]
-    covariance += np.einsum("ci,dj->cidj", shift, shift)
-    found.rig, found.covariance, found.walk = rig.moved(poses), covariance, scale * found.walk
+    found.rig, found.walk = rig.moved(poses), scale * found.walk
+    found.covariance = _with_scale_sigma(covariance, poses, sigma, replaced=True)
+
+
+def _with_scale_sigma(
+    covariance: np.ndarray, poses: np.ndarray, sigma: float, *, replaced: bool
+) -> np.ndarray:
+    """Covariance (C, 6, C, 6) with a relative standard deviation of the scale.
+
+    ``replaced``: the scale's own variance is first removed, as if it were known exactly.
+    """
+    steps = np.zeros((len(poses), 6))
+    steps[:, 3:] = poses[:, :3, 3]
+    way, flat = steps.ravel(), covariance.reshape(6 * len(poses), -1)
+    if replaced:
+        coupled = flat @ way
+        flat = flat - np.outer(coupled, coupled) / max(float(way @ coupled), 1e-12)
+    return (flat + sigma**2 * np.outer(way, way)).reshape(covariance.shape)
 
 
 def _check_walk(found: FoundRig) -> None:
@@ -426,7 +469,7 @@ def _check_walk(found: FoundRig) -> None:
         )
 
 
-def _refine(found: FoundRig, frames: Frames, people: Detections, board: Board | None) -> None:
+def _refine(found: FoundRig, frames: Frames, people: PeopleOfImages, board: Board | None) -> None:
     """Refine the poses on depth surfaces, in place."""
     if sum(camera.depth is not None for camera in found.rig) < 2:
         return
@@ -436,7 +479,8 @@ def _refine(found: FoundRig, frames: Frames, people: Detections, board: Board | 
         if refined is None:
             return
         found.rig = found.rig.moved(refined.poses)
-        found.covariance = refined.covariance
+        poses, sigma = found.rig.master_from_colour, DEPTH_SCALE_SIGMA
+        found.covariance = _with_scale_sigma(refined.covariance, poses, sigma, replaced=False)
         before, after = refined.surfaces_mm
         log.info("surfaces: %.1f to %.1f mm apart", before, after)
 

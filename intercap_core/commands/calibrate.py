@@ -70,7 +70,7 @@ def calibrate(
 
 def _record(
     project: Project, row: SequenceEntry, draft: RigDraft, folders: Sequence[Path]
-) -> list[tuple[Path, Path]]:
+) -> list[tuple[Path, Path | None]]:
     """Run stages ``frames`` and ``detections`` of the row and of further recordings of the rig.
 
     The stages read a calibration, so they get one with the cameras in a row, 1 m apart: neither
@@ -81,7 +81,7 @@ def _record(
         folders: further recordings with the same layout and cameras, without keypoints.
 
     Returns:
-        Paths of both artefacts, of the row first.
+        Paths of both artefacts, of the row first; None = people are not detected.
     """
     places = project.results / "calibrate"
     in_a_row = np.tile(np.eye(4), (len(draft.names), 1, 1))
@@ -98,11 +98,14 @@ def _record(
         )
     config = project.config.model_copy(update={"results": project.results, "dataset": "calibrate"})
     own = dataclasses.replace(project, config=config, sequences=rows)
+    detected = project.config.detections.keypoint_model is not None
     paths = []
-    for name in rows:
-        for stage in ("frames", "detections"):
-            run_step(stage, own, name, keep=True)
-        paths.append((own.artefact(name, "frames"), own.artefact(name, "detections")))
+    for name, own_row in rows.items():
+        run_step("frames", own, name, keep=True)
+        people = None
+        if own_row.keypoints is not None or detected:
+            people = run_step("detections", own, name, keep=True)
+        paths.append((own.artefact(name, "frames"), people))
     return paths
 
 
@@ -124,10 +127,11 @@ def _with_lenses(draft: RigDraft, found: FoundRig) -> RigDraft:
     if draft.content is None or not found.new_lenses:
         return draft
     entries = dict(draft.content["cameras"])
-    for name, lens in found.new_lenses.items():
+    for name, estimate in found.new_lenses.items():
+        lens = estimate.lens
         entries[name] = entries[name] | {
             "camera_matrix": lens.matrix.tolist(),
-            "distortion_coefficients": lens.distortion[:5].tolist(),
+            "distortion_coefficients": lens.distortion.tolist(),
         }
     return RigDraft(draft.names, draft.content | {"cameras": entries}, frozenset())
 
