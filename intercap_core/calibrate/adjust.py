@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.calibrate.boards import Board
 from intercap_core.calibrate.evidence import CORNERS, JOINTS, NUM_JOINTS, Views
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply_step, invert

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.calibrate.boards import Board
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig

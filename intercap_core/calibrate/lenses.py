@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from intercap_core.calibrate.boards import Board
 from intercap_core.calibrate.evidence import CORNERS, Views
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 
 MIN_VIEWS = 12  # of the board: OpenCV's guide advises ten at least; half of them are held out

@@ -20,8 +20,8 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from intercap_core.calibrate.boards import Board
 from intercap_core.calibrate.evidence import CORNERS, JOINTS, NUM_JOINTS, Views
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.camera.triangulation import triangulate
@@ -118,12 +118,8 @@ def _lag_of_rays(rig: Rig, views: Views, cameras: Sequence[int], max_lag: int) -
             continue
         rows = np.linspace(0, len(t) - 1, min(_SOUGHT, len(t))).astype(int)
         t, k = t[rows], k[rows]
-        pixels, weights = (
-            v[t][:, cameras][np.arange(len(t)), :, k] for v in (moved.pixels, moved.confidence)
-        )
-        points = triangulate(
-            pixels, weights, Rig(tuple(rig[c] for c in cameras)), max_error_px=limit
-        )
+        pixels, weights = (v[t, :, k][:, cameras] for v in (moved.pixels, moved.confidence))
+        points = triangulate(pixels, weights, some, max_error_px=limit)
         error = np.nan_to_num(points.error, nan=limit) / limit
         error[~points.inlier[:, -1]] = 1.0
         costs[lag] = float((np.minimum(error, 1.0) ** 2).mean())

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust
-from intercap_core.calibrate.boards import Board
 from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
@@ -33,6 +32,7 @@ from intercap_core.calibrate.placement import (
 from intercap_core.calibrate.refine import refine_on_surfaces
 from intercap_core.calibrate.scale import scale_by_height
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
@@ -385,12 +385,12 @@ def _lags(before: Views, after: Views) -> np.ndarray:
 def _pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
     """Agreement of every pair of cameras with common joints or boards."""
     seen = views.confidence[:, :, JOINTS] > 0
-    boards = (views.confidence[:, :, CORNERS] > 0).any(2)
+    boards: np.ndarray = (views.confidence[:, :, CORNERS] > 0).any(2)
     sizes = joints.sizes_px(rig.master_from_colour)
     pairs = []
     for a, b in combinations(range(len(rig)), 2):
         own = sizes[:, [a, b]]
-        own = own[np.isfinite(own.sum(1))]
+        own = own[np.isfinite(own).all(1)]
         error = float(np.median(own)) if len(own) else np.nan
         common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
         if any(common):

@@ -20,7 +20,7 @@ app = typer.Typer()
 
 
 Part = Literal[
-    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector"
+    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector", "rig"
 ]  # fmt: skip
 
 
@@ -54,12 +54,16 @@ def evaluate(
         list[Path] | None,
         _evaluated("the metrics", "Projects with keypoints of a real detector (make mediapipe),"),
     ] = None,
+    rig: Annotated[
+        list[Path] | None,
+        _evaluated("the detections", "Projects whose camera poses are withheld and found,"),
+    ] = None,
     only: Annotated[
         Part | None,
         typer.Option(
             help="Evaluate one part only: sequences, field and detector up to the metrics, "
             "captures and field_scenes up to the scene, objects up to the object track, bodies up "
-            "to the body fit."
+            "to the body fit, rig up to the detections."
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
@@ -107,7 +111,7 @@ def evaluate(
         raise typer.Exit(status)
     parts = {
         "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
-        "field_scenes": field_scenes, "field": field, "detector": detector,
+        "field_scenes": field_scenes, "field": field, "detector": detector, "rig": rig,
     }  # fmt: skip
     chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.calibrate.boards import parse_board
 from intercap_core.calibrate.draft import RigDraft, draft_rig, write_calibration
 from intercap_core.calibrate.rig_poses import WEAK_M, FoundRig, find_poses
 from intercap_core.commands.console import ListTable, print_plain, standard_console
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.boards import parse_board
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.output.site.calibration_page import calibration_page
 from intercap_core.pipeline.step import run_step
@@ -48,7 +48,7 @@ def calibrate(
     parsed_board = None if board is None else parse_board(board)
     parsed_distance = None if distance is None else _parse_distance(distance)
     draft = draft_rig(row, lenses, master)
-    paths = _record(project, row, draft, recordings)
+    paths = record(project, row, draft, recordings)
     found = find_poses(
         paths,
         board=parsed_board,
@@ -68,7 +68,7 @@ def calibrate(
     return path, page
 
 
-def _record(
+def record(
     project: Project, row: SequenceEntry, draft: RigDraft, folders: Sequence[Path]
 ) -> list[tuple[Path, Path | None]]:
     """Run stages ``frames`` and ``detections`` of the row and of further recordings of the rig.

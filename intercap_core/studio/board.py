@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from intercap_core.calibrate.boards import Board
+from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp

@@ -17,6 +17,7 @@ from intercap_core.commands.evaluate import (
     field,
     field_scenes,
     objects,
+    rig,
     sequences,
 )
 from intercap_core.commands.evaluate.constants import total_constants
@@ -47,6 +48,7 @@ PARTS: dict[str, EvaluationPart[Any]] = {
         field_scenes.PART,
         field.PART,
         detector.PART,
+        rig.PART,
     )
 }
 QUICK_SETTINGS = Path("config/evaluation/quick.yaml")
