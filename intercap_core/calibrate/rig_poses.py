@@ -384,8 +384,8 @@ def _lags(before: Views, after: Views) -> np.ndarray:
 
 def _pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
     """Agreement of every pair of cameras with common joints or boards."""
-    seen = views.confidence[:, :, JOINTS] > 0
-    boards: np.ndarray = (views.confidence[:, :, CORNERS] > 0).any(2)
+    seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
+    boards = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
     sizes = joints.sizes_px(rig.master_from_colour)
     pairs = []
     for a, b in combinations(range(len(rig)), 2):
