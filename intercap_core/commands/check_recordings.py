@@ -358,7 +358,9 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingCheck:
     for column in ("calibration", "keypoints", "candidates", "results", "truth"):
         path = getattr(row, column)
         if path is not None and not path.exists():
-            faults.append(f"column {column} names {path}, which does not exist")
+            hint = f"; intercap calibrate SETTINGS {row.sequence} can find it"
+            advice = hint if column == "calibration" else ""
+            faults.append(f"column {column} names {path}, which does not exist{advice}")
     if row.truth is not None and row.truth.exists():
         faults += faults_of_truth(row.truth)
     if not row.recordings.is_dir() or not row.calibration.exists():
