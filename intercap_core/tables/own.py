@@ -218,8 +218,8 @@ def _find_calibration(row: Row, root: Path, recording: Recording, used: frozense
         return path
     row.remarks.append(
         f"{FILL_IN} no calibration of {', '.join(recording.cameras)} is found in the folder of the "
-        "recordings or above; name it in the column calibration (docs/recordings.md), or find it by "
-        "intercap calibrate"
+        "recordings or above; name it in the column calibration (docs/recordings.md), or find it "
+        "by intercap calibrate"
     )
     return recording.folder / "calibration.json"
 
