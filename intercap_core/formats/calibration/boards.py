@@ -39,12 +39,21 @@ class Board:
     """Draws the board in a size (width, height) in pixels, of the proportions of ``extent``."""
 
     def locate(self, image: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of all corners of a grey or BGR image; NaN = not found."""
+        """Pixels (N, 2) of all corners of a grey or BGR image; NaN = not found.
+
+        If there are none, the mirrored image is searched: some boards have a mirrored print on
+        their back, so that cameras on both sides see the same corners.
+        """
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
         result = np.full((len(self.corners), 2), np.nan)
-        index, pixels = self.find(grey)
-        if len(index) >= MIN_CORNERS and not _on_a_line(self.corners[index]):
+        for mirrored in (False, True):
+            index, pixels = self.find(np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey)
+            if len(index) < MIN_CORNERS or _on_a_line(self.corners[index]):
+                continue
+            if mirrored:
+                pixels = pixels * (-1, 1) + (grey.shape[1] - 1, 0)
             result[index] = pixels
+            break
         return result
 
 
@@ -117,7 +126,9 @@ def _charuco(
     if lengths[1] >= lengths[0]:
         raise UserError(f"--board {text!r}: the marker must be smaller than the square")
     board = cv2.aruco.CharucoBoard((columns, rows), lengths[0], lengths[1], dictionary)
-    detector = cv2.aruco.CharucoDetector(board)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.detectInvertedMarker = True  # some boards are printed white on black
+    detector = cv2.aruco.CharucoDetector(board, detectorParams=parameters)
 
     def find(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pixels, index, _, _ = detector.detectBoard(grey)
@@ -135,6 +146,7 @@ def _april_grid(
 ) -> Board:
     board = cv2.aruco.GridBoard((columns, rows), lengths[0], lengths[1], dictionary)
     parameters = cv2.aruco.DetectorParameters()
+    parameters.detectInvertedMarker = True
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
