@@ -76,7 +76,7 @@ def parse_board(text: str) -> Board:
         lengths = [float(field) for field in fields[1 : 1 + count]]
     except ValueError:
         raise wrong from None
-    if min(columns, rows) < 2:
+    if min(columns, rows) < (3 if kind == "checkerboard" else 2):  # OpenCV finds no smaller one
         raise wrong
     too_large = 2.0  # metres; a length of a square beyond it is in millimetres or centimetres
     if not all(0 < length < too_large for length in lengths):
@@ -84,6 +84,12 @@ def parse_board(text: str) -> Board:
     if kind == "checkerboard":
         return _checkerboard(columns, rows, lengths[0], text)
     dictionary = _dictionary(fields[-1], text)
+    markers = columns * rows // (2 if kind == "charuco" else 1)
+    if markers > (known := len(dictionary.bytesList)):
+        raise UserError(
+            f"--board {text!r}: the board has {markers} markers, but dictionary {fields[-1]} only "
+            f"{known}; correct the columns and rows, or the dictionary"
+        )
     if kind == "charuco":
         return _charuco(columns, rows, lengths, dictionary, text)
     return _april_grid(columns, rows, lengths, dictionary)
@@ -113,7 +119,8 @@ def _checkerboard(columns: int, rows: int, square: float, text: str) -> Board:
 
     def draw(size: tuple[int, int]) -> np.ndarray:
         u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-        dark = (u * (columns + 1) // size[0] + v * (rows + 1) // size[1]) % 2 == 0
+        # OpenCV counts corners from the one whose outer square is white
+        dark = (u * (columns + 1) // size[0] + v * (rows + 1) // size[1]) % 2 == 1
         return np.where(dark, 0, 255).astype(np.uint8)
 
     extent = square * np.array([[-1, -1], [columns, rows]])
