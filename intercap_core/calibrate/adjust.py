@@ -92,7 +92,9 @@ class JointTerm:
         share = min(1.0, gap / KEYPOINT_ERROR_TIME_S)
         self._share = share * views.confidence[t, :, self._joint]
         self.points = joints[t, self._joint]
-        self._insets = np.zeros(NUM_JOINTS)
+        """(N, 3) joints, metres."""
+        self.insets = np.zeros(NUM_JOINTS)
+        """(K,) metres by which each joint lies deeper than assumed."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -122,7 +124,7 @@ class JointTerm:
         insets = -np.linalg.solve(matrix, gradient)
         right = slope + cross * insets[self._joint][:, None]
         self.points = self.points - np.linalg.solve(own, right[..., None])[..., 0]
-        self._insets = self._insets + insets
+        self.insets = self.insets + insets
 
     def _reduced(self, poses: np.ndarray) -> tuple[np.ndarray, ...]:
         """Normal equations with the joints eliminated.
@@ -134,7 +136,7 @@ class JointTerm:
         pixel = _Pixels(self._rig, poses, self.points, self._pixels)
         away = np.maximum(np.linalg.norm(pixel.arm, axis=-1), 1e-9)
         has = np.isfinite(self._distance)
-        off = np.where(has, away - self._distance - self._insets[self._joint][:, None], 0.0)
+        off = np.where(has, away - self._distance - self.insets[self._joint][:, None], 0.0)
         robust = geman_mcclure_weight(off**2, ROBUST_SIGMA * DISTANCE_M)
         along = (pixel.arm / away[..., None])[..., None, :]  # (N, C, 1, 3)
         by_point = np.concatenate([pixel.by_point, along], -2)  # (N, C, 3, 3)
@@ -174,7 +176,7 @@ class JointTerm:
             )
         )
         matrix[place, place] = own_matrix + INSET_M**-2
-        gradient[size:] = own_slope + self._insets / INSET_M**2
+        gradient[size:] = own_slope + self.insets / INSET_M**2
         matrix[size:, :size], matrix[:size, size:] = of_joint, of_joint.T
         insets = matrix[size:, size:]
         both = np.linalg.solve(insets, np.column_stack([matrix[size:, :size], gradient[size:]]))
