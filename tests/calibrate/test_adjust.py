@@ -109,9 +109,7 @@ def test_normal_equations_of_joints_agree_with_a_dense_system() -> None:
     )
     jacobian = derivatives(flat, size)
     weighted = jacobian.T * weight
-    assert_equal_systems(
-        system, reduced(weighted @ jacobian, weighted @ flat(np.zeros(size)), 18)
-    )
+    assert_equal_systems(system, reduced(weighted @ jacobian, weighted @ flat(np.zeros(size)), 18))
 
 
 def test_normal_equations_of_boards_agree_with_a_dense_system() -> None:

@@ -153,7 +153,6 @@ def _april_grid(
 ) -> Board:
     board = cv2.aruco.GridBoard((columns, rows), lengths[0], lengths[1], dictionary)
     parameters = cv2.aruco.DetectorParameters()
-    parameters.detectInvertedMarker = True
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 

@@ -27,9 +27,7 @@ def warp(text: str, turn_deg: float) -> tuple[np.ndarray, np.ndarray]:
     angle = np.radians(turn_deg)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     target = (seen @ rotation.T) * CANVAS.max() * 0.9 + CANVAS / 2
-    homography = cv2.getPerspectiveTransform(
-        outline.astype(np.float32), target.astype(np.float32)
-    )
+    homography = cv2.getPerspectiveTransform(outline.astype(np.float32), target.astype(np.float32))
     image = cv2.warpPerspective(drawing, homography, CANVAS.tolist(), borderValue=120,
                                 flags=cv2.INTER_AREA)  # fmt: skip
     pixels = cv2.perspectiveTransform(place[None].astype(np.float64), homography)[0]
@@ -81,3 +79,13 @@ def test_a_wrong_description_names_the_expected_form(text: str, expected: str) -
         parse_board(text)
     assert text in str(raised.value)
     assert expected in str(raised.value)
+
+
+def test_a_mirrored_print_on_the_back_has_the_same_corners() -> None:
+    image, truth = warp(EXAMPLES[0], 0)
+    for photo in (image, 255 - image):  # also printed white on black
+        found = parse_board(EXAMPLES[0]).locate(np.ascontiguousarray(photo[:, ::-1]))
+        seen = np.isfinite(found[:, 0])
+        assert seen.mean() > 0.8
+        back = found * (-1, 1) + (image.shape[1] - 1, 0)
+        assert np.linalg.norm(back - truth, axis=1)[seen].max() < 1.5
