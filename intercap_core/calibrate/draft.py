@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
-from intercap_core.formats.calibration.opencv import load_opencv
+from intercap_core.formats.calibration.opencv import read_content
 from intercap_core.formats.recordings import k4a, plain
 
 _POSE_FIELDS = ("R", "T", "rvec", "tvec")
@@ -34,6 +34,9 @@ class RigDraft:
 
 def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> RigDraft:
     """Find the cameras of a row and their stated lenses.
+
+    Raises UserError if the recordings have fewer than two cameras or lack the master, if the layout
+    states poses, and if the file of lenses cannot be read.
 
     Args:
         lenses: calibration with lenses, with or without poses; None = ``calibration`` of the row if
@@ -57,6 +60,11 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
             f"{row.recordings}: holds no recording of layout {row.layout}; correct 'recordings' or "
             "'layout' in the table of sequences"
         )
+    if len(names) < 2:
+        raise UserError(
+            f"{row.recordings}: holds recordings of camera {names[0]!r} only, expected two cameras "
+            "or more; one camera needs no poses: write its lens with R and T zero"
+        )
     if row.layout == "k4a":
         return RigDraft(_ordered(names, master, row.recordings), None, frozenset())
     source = lenses or (row.calibration if row.calibration.exists() else None)
@@ -67,7 +75,9 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
     for name, entry in entries.items():
         for field in _POSE_FIELDS:
             entry.pop(field, None)
-        if "image_size" not in entry and "image_width" not in entry:
+        if "image_width" in entry and "image_height" in entry:
+            entry["image_size"] = [entry.pop("image_width"), entry.pop("image_height")]
+        if "image_size" not in entry:
             entry["image_size"] = _image_size(row.recordings, name)
     without = frozenset(n for n in names if any(f not in entries[n] for f in _LENS_FIELDS))
     content |= {"master": names[0], "cameras": {name: entries[name] for name in names}}
@@ -78,11 +88,7 @@ def _read_lenses(source: Path | None) -> dict[str, Any]:
     """Content of a calibration file in OpenCV's terms, or of a folder with a file per camera."""
     if source is None:
         return {"cameras": {}}
-    if source.is_dir():
-        suffixes = (".json", ".yaml", ".yml")
-        files = [path for path in sorted(source.iterdir()) if path.suffix.lower() in suffixes]
-        return {"cameras": {file.stem: load_opencv(file) for file in files}}
-    content = load_opencv(source)
+    content = read_content(source)
     if not isinstance(content.get("cameras"), dict):
         raise UserError(
             f"{source}: expected 'cameras' with a lens for each; docs/recordings.md shows one"
@@ -122,7 +128,7 @@ def posed_content(draft: RigDraft, poses: np.ndarray) -> dict[str, Any]:
         entry = dict(draft.content["cameras"][name])
         if name in draft.without_lens and "camera_matrix" not in entry:
             width, height = entry["image_size"]
-            focal = 0.9 * max(width, height)  # 58 degrees wide, until the board tells
+            focal = 0.9 * max(width, height)  # 58 degrees wide, until the board is seen
             matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
             entry |= {"camera_matrix": matrix, "distortion_coefficients": [0.0] * 5}
         rotation = pose[:3, :3].T

@@ -18,6 +18,7 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.person.lifting import INSETS_M, DepthRelief
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
+from intercap_core.scene.starts import shift_images
 
 NUM_JOINTS = len(BODY_POINTS)
 JOINTS = slice(0, NUM_JOINTS)
@@ -41,38 +42,47 @@ class Views:
     """(T, C, M) from 0 (not seen) to 1."""
     distance: np.ndarray
     """(T, C, M) metres from the camera's centre along the ray, by depth; NaN = not measured."""
+    lags: np.ndarray
+    """(R, C) sets by which the images of each recording were moved by :meth:`late`."""
 
     def subset(self, sets: np.ndarray) -> Views:
         """The sets of a mask (T,) or of indices."""
         names = ("times", "recording", "pixels", "confidence", "distance")
-        return Views(*(getattr(self, name)[sets] for name in names))
+        return replace(self, **{name: getattr(self, name)[sets] for name in names})
+
+    def only(self, kept: np.ndarray) -> Views:
+        """The same views without the points outside a mask that broadcasts to (T, C, M)."""
+        return replace(
+            self,
+            pixels=np.where(kept[..., None], self.pixels, np.nan),
+            confidence=np.where(kept, self.confidence, 0.0),
+            distance=np.where(kept, self.distance, np.nan),
+        )
 
     def late(self, camera: int, recording: int, lag: int) -> Views:
         """The same views with images of a camera in a recording from ``lag`` sets later."""
         rows = np.flatnonzero(self.recording == recording)
-        source = np.arange(len(rows)) + lag
-        inside = (source >= 0) & (source < len(rows))
-        changed = {}
+        lags = self.lags.copy()
+        lags[recording, camera] += lag
+        changed = {"lags": lags}
         for name, none in (("pixels", np.nan), ("confidence", 0.0), ("distance", np.nan)):
             values = getattr(self, name).copy()
-            own = values[rows, camera]
-            moved = np.full_like(own, none)
-            moved[inside] = own[source[inside]]
-            values[rows, camera] = moved
+            own = values[rows][:, [camera]]
+            values[rows, camera] = shift_images(own, np.array([lag]), none)[:, 0]
             changed[name] = values
         return replace(self, **changed)
 
     @classmethod
     def joined(cls, parts: Sequence[Views]) -> Views:
         """The sets of several recordings of the same cameras, numbered in this order."""
-        names = ("times", "pixels", "confidence", "distance")
+        names = ("times", "pixels", "confidence", "distance", "lags")
         joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         numbers = np.repeat(np.arange(len(parts)), [len(part.times) for part in parts])
         return cls(recording=numbers, **joined)
 
 
 class Nobody:
-    """People of a recording in which nobody is detected."""
+    """A recording without a detected person; see :class:`PeopleOfImages`."""
 
     def __init__(self, num_sets: int) -> None:
         self.num_sets = num_sets
@@ -106,7 +116,8 @@ def find_views(frames: Frames, people: PeopleOfImages, rig: Rig, board: Board | 
             with_board = confidence[t, c, CORNERS].any()
             if camera.depth is not None and (with_board or lifted[t]):
                 distance[t, c] = _distances(frames.depth(t, c), camera, pixels[t, c], inset)
-    return Views(frames.time_s, np.zeros(sets, int), pixels, confidence, distance)
+    lags, number = np.zeros((1, views), int), np.zeros(sets, int)
+    return Views(frames.time_s, number, pixels, confidence, distance, lags)
 
 
 def _some(times: np.ndarray, rate: float) -> np.ndarray:

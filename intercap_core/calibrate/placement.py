@@ -25,13 +25,15 @@ from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.camera.triangulation import triangulate
+from intercap_core.scene.starts import shift_images
 
 # Reprojection error of an inlier, pixels of a 1080p image. Lifted joints are 3 cm off, which is
 # 12 px at 2.5 m from another side; twice that and the detector's error.
 MAX_ERROR_PX = 30.0
 MIN_POINTS = 60  # reference points of a camera, as body joints of more than two sets
 MIN_GAIN = 0.02  # of the cost by which a lag is better than none; a set of a walk costs 0.1
-MIN_SHARE = 0.4  # of inliers; wrong poses agree with less than a quarter
+MIN_SHARE = 0.5  # of inliers; wrong poses agree with two of five boards, or a quarter of the joints
+MAX_COST = 0.3  # at a lag that cannot be compared with none, for lack of points at lag 0
 FIRST_DISTANCE_M = 2.5  # assumed median distance of joints while the scale is unknown
 _SOUGHT = 400  # reference points with which lags are searched
 
@@ -129,22 +131,17 @@ def _lag_of_rays(rig: Rig, views: Views, cameras: Sequence[int], max_lag: int) -
 def _clearest(costs: dict[int, float]) -> int:
     """The lag of least cost, or 0 if its cost is hardly less than that of lag 0.
 
-    A person who stands still fits at all lags.
+    A person who stands still fits at all lags. A lag at which a few points overlap fits by chance.
     """
     if not costs:
         return 0
     best = min(costs, key=lambda lag: (costs[lag], abs(lag)))
-    return best if costs[best] < costs.get(0, np.inf) - MIN_GAIN else 0
+    return best if costs[best] < costs.get(0, MAX_COST) - MIN_GAIN else 0
 
 
 def _shifted(values: np.ndarray, lag: int) -> np.ndarray:
     """Values (T, ...) of ``lag`` sets later; NaN outside."""
-    result = np.full_like(values, np.nan)
-    count = len(values) - abs(lag)
-    if count > 0:
-        start, source = max(0, -lag), max(0, lag)
-        result[start : start + count] = values[source : source + count]
-    return result
+    return shift_images(values[:, None], np.array([lag]), np.nan)[:, 0]
 
 
 def _solve(
@@ -253,7 +250,7 @@ def first_pair(rig: Rig, views: Views, max_lag: int) -> tuple[int, Placement] | 
         rays = [rig[c].colour.unproject(views.pixels[:, c, JOINTS])[..., :2] for c in (a, b)]
         limit = MAX_ERROR_PX / 3 * rig[a].colour.height / 1080 / rig[a].colour.fx
         costs = {
-            lag: -found[2]
+            lag: 1 - found[2]
             for lag in range(-max_lag, max_lag + 1)
             if (found := _essential(rays[0], _shifted(rays[1], lag), limit, _SOUGHT))
         }

@@ -5,99 +5,59 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from itertools import combinations
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust
 from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
     MIN_SEEN,
+    NUM_JOINTS,
     Nobody,
     Views,
     find_views,
 )
+from intercap_core.calibrate.found_rig import (
+    FoundRig,
+    compare_pairs,
+    count_shared_joints,
+)
 from intercap_core.calibrate.lenses import LensEstimate, describe_coverage, estimate_lens
 from intercap_core.calibrate.placement import (
     Placement,
-    board_pose,
     board_poses,
     first_camera,
     place_all,
     reference_points,
 )
 from intercap_core.calibrate.refine import refine_on_surfaces
-from intercap_core.calibrate.scale import scale_by_height
+from intercap_core.calibrate.scale import add_scale_sigma, check_board_size, rescale
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.boards import Board
 from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.scene.camera_verdicts import weakest_motion
 from intercap_core.scene.registration import Constraint
 from intercap_core.scene.start_times import MAX_DELAY_S
 
 log = logging.getLogger(__name__)
 
+HIPS = [KEYPOINT_INDEX["left_hip"], KEYPOINT_INDEX["right_hip"]]
 MIN_WALK_M = 0.4  # extent of the person's way; less moves every joint within its detector's errors
-WEAK_M = 0.03  # standard deviation at the rig's centre from which a camera is called weak
+MIN_WALK_S = 3.0  # in less, errors of a detector hardly change, so they do not show
+# Largest median error of a camera's joints or corners over that of all cameras; those of the
+# studio's rigs are below 2, with left and right exchanged above 10
+MAX_ERROR_RATIO = 4.0
 MAX_GRAVITY_DEG = 5.0  # between gravity sensors; one of a Kinect is within a degree
 # Relative error of the scale that depth cameras share: the systematic error of an Azure Kinect is
 # at most 11 mm + 0.1 % of the depth (data sheet), taken as two standard deviations; mean of six
 # cameras at 2.5 m.
 DEPTH_SCALE_SIGMA = 0.0015
-MAX_BOARD_FACTOR = 0.05  # by which a board's size may contradict the depth
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """How well two cameras agree."""
-
-    cameras: tuple[int, int]
-    joints: int
-    """Number of joints that both see at one time."""
-    boards: int
-    """Number of sets in which both see the board."""
-    error_px: float
-    """Median reprojection error of these joints in both, pixels of a 1080p image; NaN = none."""
-
-
-@dataclass(eq=False)
-class FoundRig:
-    """Poses of a rig and what they rest on."""
-
-    rig: Rig
-    """The cameras at their found poses, the master first."""
-    covariance: np.ndarray
-    """(C, 6, C, 6) of rotations about the cameras' centres, rad, and translations, metres."""
-    joint_error_px: np.ndarray
-    """(C,) median reprojection error of joints, pixels of a 1080p image; NaN = none."""
-    corner_error_px: np.ndarray
-    """(C,) the same of the board's corners."""
-    joints: np.ndarray
-    """(C,) number of joints seen together with another camera."""
-    boards: np.ndarray
-    """(C,) number of sets in which the camera sees the board."""
-    lags: np.ndarray
-    """(C,) sets by which the images of the first recording are late."""
-    pairs: list[Pair]
-    walk: np.ndarray
-    """(T, 3) middle of the person's hips, master frame, metres; NaN = unknown."""
-    scale: str
-    """What determines the scale."""
-    notes: list[str] = field(default_factory=list)
-    new_lenses: dict[str, LensEstimate] = field(default_factory=dict)
-    """Estimated or refined lenses by camera."""
-
-    def sigma_m(self, camera: int) -> float:
-        """Standard deviation of the rig's centre as the camera sees it, in its worst direction."""
-        pose = self.rig.master_from_colour[camera]
-        block = self.covariance[camera, :, camera]
-        return weakest_motion(block, pose, ring_centre(self.rig))[0]
 
 
 def find_poses(
@@ -114,8 +74,8 @@ def find_poses(
     Raises UserError, with what to record instead, if the recordings do not determine all poses.
 
     Args:
-        recordings: frames and detections artefacts of recordings of the rig, None = nobody is
-            detected; the first is used for surfaces.
+        recordings: frames and detections artefacts of recordings of the rig (None = without
+            detections); the first is used for surfaces.
         height_m: height of the subject, None = unknown; used if nothing else gives the scale.
         distance: two cameras and the metres between their lenses; overrides all other scales.
         without_lens: cameras whose lens is a guess, to be estimated from the board.
@@ -137,8 +97,9 @@ def find_poses(
         notes: list[str] = []
         rig, new_lenses = _lenses(rig, views, board, without_lens, keep_lenses, notes)
         if board is not None:
-            _check_board_size(rig, views, board)
-        found = _place(rig, views, board, max(1, round(MAX_DELAY_S * opened[0].fps)))
+            check_board_size(rig, views, board)
+        max_lag = max(1, round(MAX_DELAY_S * opened[0].fps))
+        found, views, of_board = _place(rig, views, board, max_lag)
         found.notes += notes
         found.new_lenses = new_lenses
         _add_lens_errors(found)
@@ -146,10 +107,11 @@ def find_poses(
         found.scale = "depth" if metric else ""
         if metric and board is not None and found.boards.any():
             found.scale = "board" if not _has_depth(views) else "board and depth"
+        _check_agreement(found)
+        _refine(found, opened[0], people[0], of_board)
         if distance is not None or not metric:
-            _rescale(found, views, distance, height_m)
-        _check_walk(found)
-        _refine(found, opened[0], people[0], board)
+            rescale(found, views, distance, height_m)
+        _check_walk(found, views)
         _check_gravity(found.rig, opened[0].gravity)
         return found
 
@@ -244,32 +206,11 @@ def _add_lens_errors(found: FoundRig) -> None:
             found.covariance[other, :, other] += own
 
 
-def _check_board_size(rig: Rig, views: Views, board: Board) -> None:
-    """Raise UserError if depth contradicts the board's size."""
-    ratios = []
-    for t, c in np.argwhere(np.isfinite(views.distance[:, :, CORNERS]).any(2)).tolist():
-        pose = board_pose(rig[c], board, views.pixels[t, c, CORNERS])
-        if pose is not None:
-            away = np.linalg.norm(board.corners @ pose[:3, :3].T + pose[:3, 3], axis=1)
-            ratios.append(np.nanmedian(views.distance[t, c, CORNERS] / away))
-    if len(ratios) < 5:
-        return
-    ratio = float(np.median(ratios))
-    if abs(ratio - 1) > MAX_BOARD_FACTOR:
-        raise UserError(
-            f"by the depth, the board is {ratio:.2f} times as large as --board states (or the "
-            "depth's unit is wrong); measure a square on the printed board and correct --board"
-        )
-
-
 def _terms(
     rig: Rig, views: Views, placed: Sequence[int], board: Board | None
 ) -> tuple[JointTerm, BoardTerm | None]:
     """The terms of the adjustment with the ``placed`` cameras only."""
-    hidden = [c for c in range(len(rig)) if c not in placed]
-    pixels, confidence = views.pixels.copy(), views.confidence.copy()
-    pixels[:, hidden], confidence[:, hidden] = np.nan, 0.0
-    views = replace(views, pixels=pixels, confidence=confidence)
+    views = views.only(np.isin(np.arange(len(rig)), placed)[:, None])
     joints = JointTerm(rig, views, reference_points(rig, views, placed, None)[:, JOINTS])
     if board is None:
         return joints, None
@@ -280,15 +221,19 @@ def _in_use(terms: tuple[JointTerm, BoardTerm | None]) -> list[Constraint]:
     return [term for term in terms if term is not None and len(term)]
 
 
-def _place(rig: Rig, views: Views, board: Board | None, max_lag: int) -> FoundRig:
-    """Place and adjust all cameras, relative to the first of the rig."""
+def _place(
+    rig: Rig, views: Views, board: Board | None, max_lag: int
+) -> tuple[FoundRig, Views, list[BoardTerm]]:
+    """Place and adjust all cameras, relative to the first of the rig.
+
+    Returns also the views with corrected lags, and the term of the board if two cameras see it.
+    """
 
     def improve(at: Rig, seen: Views, placed: Sequence[int]) -> Rig:
         terms = _in_use(_terms(at, seen, placed, board))
         return at.moved(adjust(terms, at.master_from_colour, placed[1:], steps=8)[0])
 
     log.info("placing %d cameras", len(rig))
-    before = views
     rig, views, placed, left = place_all(rig, views, board, max_lag, improve)
     if len(placed) < len(rig):
         raise UserError(_describe_unplaced(rig, placed, left))
@@ -296,44 +241,54 @@ def _place(rig: Rig, views: Views, board: Board | None, max_lag: int) -> FoundRi
     everyone = list(range(len(rig)))
     terms = _terms(rig, views, everyone, board)
     poses, covariance, _ = adjust(_in_use(terms), rig.master_from_colour, everyone[1:])
-    # errors that sets share do not show in the residuals: compare the halves of the recording
-    factor = _half_factor(rig.moved(poses), views, board, poses, covariance)
     rig = rig.moved(poses)
+    factor = _half_factor(rig, views, board)
     joints, boards = terms
-    walk = reference_points(rig, views, everyone, None)[:, 8]  # middle of the hips
+    walk = reference_points(rig, views, everyone, None)[:, HIPS].mean(1)
     nothing = np.full(len(rig), np.nan)
-    return FoundRig(
+    found = FoundRig(
         rig=rig,
         covariance=factor * covariance,
         joint_error_px=joints.errors_px(poses) if len(joints) else nothing,
         corner_error_px=boards.errors_px(poses) if boards is not None and len(boards) else nothing,
-        joints=_shared_joints(views),
+        joints=count_shared_joints(views),
         boards=(views.confidence[:, :, CORNERS] > 0).any(2).sum(0),
-        lags=_lags(before, views),
-        pairs=_pairs(rig, views, joints),
+        lags=views.lags[0],
+        pairs=compare_pairs(rig, views, joints),
         walk=walk,
         scale="",
     )
+    return found, views, [boards] if boards is not None and len(boards) else []
 
 
-def _half_factor(
-    rig: Rig, views: Views, board: Board | None, poses: np.ndarray, covariance: np.ndarray
-) -> float:
-    """Factor on the covariance by which poses from even and from odd seconds differ; 1 or more."""
-    everyone = list(range(len(rig)))
-    even = np.floor(views.times).astype(int) % 2 == 0
-    halves = []
-    for rows in (even, ~even):
-        if rows.sum() < 3:
-            return 1.0
-        terms = _in_use(_terms(rig, views.subset(rows), everyone, board))
-        if not terms:
-            return 1.0
-        halves.append(adjust(terms, poses, everyone[1:], steps=10)[0])
-    apart = np.linalg.norm((halves[0] - halves[1])[1:, :3, 3], axis=1)
-    expected = [np.trace(covariance[c, 3:, c, 3:]) for c in everyone[1:]]
-    # the difference of two halves has four times the variance of the whole
-    return max(1.0, float(np.mean(apart**2 / np.maximum(expected, 1e-12))) / 4)
+def _half_factor(rig: Rig, views: Views, board: Board | None) -> float:
+    """Factor, 1 or more, on the covariance by which poses from two halves of the views differ.
+
+    Errors that many images share do not show in the residuals. Those that last for seconds show
+    between the halves of a recording, those that a joint has all the time between halves of the
+    joints. The larger factor counts. The scale is left out: joints without depth do not determine
+    it.
+    """
+    poses, others = rig.master_from_colour, list(range(1, len(rig)))
+    recordings = range(views.recording.max() + 1)
+    middle = np.array([np.median(views.times[views.recording == k]) for k in recordings])
+    early = (views.times < middle[views.recording])[:, None, None]
+    point = np.arange(views.pixels.shape[2])
+    factors = [1.0]
+    for half in (early, np.where(point < NUM_JOINTS, point % 2 == 0, early)):
+        parts = [
+            _in_use(_terms(rig, views.only(kept), [0, *others], board)) for kept in (half, ~half)
+        ]
+        if all(parts):
+            found, covariances, _ = zip(
+                *(adjust(terms, poses, others, steps=10) for terms in parts), strict=True
+            )
+            first, second = (at[:, :3, 3] for at in found)
+            apart = first - second * (first * second).sum() / (second**2).sum()
+            expected = add_scale_sigma(np.sum(covariances, 0), poses, 0.0, replaced=True)
+            variance = np.array([np.trace(expected[c, 3:, c, 3:]) for c in others])
+            factors.append(float(np.mean((apart[others] ** 2).sum(1) / variance)))
+    return max(factors)
 
 
 def _describe_unplaced(rig: Rig, placed: Sequence[int], left: Sequence[Placement]) -> str:
@@ -359,128 +314,54 @@ def _describe_unplaced(rig: Rig, placed: Sequence[int], left: Sequence[Placement
     )
 
 
-def _shared_joints(views: Views) -> np.ndarray:
-    """Number (C,) of joints that each camera sees together with another one."""
-    seen = views.confidence[:, :, JOINTS] > 0
-    return (seen & (seen.sum(1, keepdims=True) >= 2)).sum((0, 2))
-
-
-def _lags(before: Views, after: Views) -> np.ndarray:
-    """Sets (C,) by which images of the first recording were moved."""
-    lags = np.zeros(before.confidence.shape[1], int)
-    rows = before.recording == 0
-    sets = int(rows.sum())
-    for c in range(len(lags)):
-        old, new = (v.confidence[rows, c] for v in (before, after))
-        agree = {
-            lag: np.array_equal(old[lag:], new[: sets - lag])
-            if lag >= 0
-            else np.array_equal(old[:lag], new[-lag:])
-            for lag in sorted(range(-sets + 1, sets), key=abs)
-        }
-        lags[c] = next((lag for lag, same in agree.items() if same), 0)
-    return lags
-
-
-def _pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
-    """Agreement of every pair of cameras with common joints or boards."""
-    seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
-    boards = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
-    sizes = joints.sizes_px(rig.master_from_colour)
-    pairs = []
-    for a, b in combinations(range(len(rig)), 2):
-        own = sizes[:, [a, b]]
-        own = own[np.isfinite(own).all(1)]
-        error = float(np.median(own)) if len(own) else np.nan
-        common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
-        if any(common):
-            pairs.append(Pair((a, b), *common, error))
-    return pairs
-
-
-def _rescale(
-    found: FoundRig,
-    views: Views,
-    distance: tuple[str, str, float] | None,
-    height_m: float | None,
-) -> None:
-    """Scale the rig by a stated distance or by the subject's height, in place."""
-    rig, names = found.rig, found.rig.names
-    if distance is not None:
-        for name in distance[:2]:
-            if name not in names:
-                known = ", ".join(names)
-                raise UserError(f"--distance names camera {name!r}; expected one of {known}")
-        a, b = (rig.master_from_colour[names.index(name), :3, 3] for name in distance[:2])
-        scale, sigma = distance[2] / float(np.linalg.norm(a - b)), 0.005 / distance[2]  # 5 mm
-        found.scale = f"the stated distance between {distance[0]} and {distance[1]}"
-    else:
-        joints = reference_points(rig, views, list(range(len(rig))), None)[:, JOINTS]
-        scale, sigma = scale_by_height(joints, height_m)
-        if not np.isfinite(scale):
+def _check_walk(found: FoundRig, views: Views) -> None:
+    """Raise UserError if a camera without a board shares no walk with the others."""
+    joints = (views.confidence[:, :, JOINTS] > 0).sum(2) >= MIN_SEEN
+    common = joints & (joints.sum(1, keepdims=True) >= 2) & np.isfinite(found.walk[:, :1])
+    for c in np.flatnonzero(found.boards == 0).tolist():
+        rows = common[:, c]
+        extent = lasts = 0.0
+        if rows.any():
+            low, high = np.quantile(found.walk[rows], (0.02, 0.98), axis=0)
+            extent = float(np.linalg.norm(high - low))
+            own = [views.times[rows & (views.recording == k)] for k in np.unique(views.recording)]
+            lasts = max(float(np.ptp(times)) for times in own if len(times))
+        if extent < MIN_WALK_M or lasts < MIN_WALK_S:
             raise UserError(
-                "nothing determines the scale: the person's limbs are not seen; state the distance "
-                "of two cameras (--distance k1:k2:METRES) or show a board"
+                f"camera {found.rig.names[c]} and another one see the person together for "
+                f"{lasts:.1f} s and {extent:.2f} m of its way, expected at least {MIN_WALK_S:g} s "
+                f"and {MIN_WALK_M:g} m: let the person walk through the whole area that the "
+                "cameras share, or show a board. Nothing was written"
             )
-        stated = f"{height_m:.2f} m" if height_m else "unknown, taken as 1.70 m"
-        found.scale = f"the subject's height ({stated})"
-        if not height_m:
-            found.notes.append(
-                f"the scale is known to {100 * sigma:.0f} % only: state the subject's height in "
-                "the table of subjects, or the distance of two cameras (--distance)"
+
+
+def _check_agreement(found: FoundRig) -> None:
+    """Raise UserError if the joints or corners of a camera contradict its pose."""
+    for points, errors in (("joints", found.joint_error_px), ("corners", found.corner_error_px)):
+        usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else np.inf
+        for c in np.flatnonzero(errors > MAX_ERROR_RATIO * usual).tolist():
+            raise UserError(
+                f"camera {found.rig.names[c]}: its {points} are {errors[c]:.1f} px from where the "
+                f"other cameras see them, whose median is {usual:.1f} px. Its keypoints may be of "
+                "another person or have left and right exchanged, its lens may be wrong, or it was "
+                "moved; correct that and calibrate again. Nothing was written"
             )
-    poses = rig.master_from_colour.copy()
-    poses[:, :3, 3] *= scale
-    covariance = found.covariance.copy()
-    covariance[:, 3:] *= scale
-    covariance[:, :, :, 3:] *= scale
-    found.rig, found.walk = rig.moved(poses), scale * found.walk
-    found.covariance = _with_scale_sigma(covariance, poses, sigma, replaced=True)
 
 
-def _with_scale_sigma(
-    covariance: np.ndarray, poses: np.ndarray, sigma: float, *, replaced: bool
-) -> np.ndarray:
-    """Covariance (C, 6, C, 6) with a relative standard deviation of the scale.
-
-    ``replaced``: the scale's own variance is first removed, as if it were known exactly.
-    """
-    steps = np.zeros((len(poses), 6))
-    steps[:, 3:] = poses[:, :3, 3]
-    way, flat = steps.ravel(), covariance.reshape(6 * len(poses), -1)
-    if replaced:
-        coupled = flat @ way
-        flat = flat - np.outer(coupled, coupled) / max(float(way @ coupled), 1e-12)
-    return (flat + sigma**2 * np.outer(way, way)).reshape(covariance.shape)
-
-
-def _check_walk(found: FoundRig) -> None:
-    """Raise UserError if the poses rest on a person who stands still."""
-    known: np.ndarray = found.walk[np.isfinite(found.walk[:, 0])]
-    if found.boards.any() or len(known) < 2:
-        return
-    low, high = np.quantile(known, (0.02, 0.98), axis=0)
-    extent = float(np.linalg.norm(high - low))
-    if extent < MIN_WALK_M:
-        raise UserError(
-            f"the person moves by {extent:.2f} m only, expected at least {MIN_WALK_M:g} m: let the "
-            "person walk through the whole area that the cameras share, or show a board. Nothing "
-            "was written"
-        )
-
-
-def _refine(found: FoundRig, frames: Frames, people: PeopleOfImages, board: Board | None) -> None:
+def _refine(
+    found: FoundRig, frames: Frames, people: PeopleOfImages, terms: Sequence[BoardTerm]
+) -> None:
     """Refine the poses on depth surfaces, in place."""
     if sum(camera.depth is not None for camera in found.rig) < 2:
         return
     log.info("registering surfaces")
     for _ in range(2):  # the second time, people and backgrounds are found at better poses
-        refined = refine_on_surfaces(frames.at(found.rig), people, 0, [])
+        refined = refine_on_surfaces(frames.at(found.rig), people, 0, terms)
         if refined is None:
             return
         found.rig = found.rig.moved(refined.poses)
         poses, sigma = found.rig.master_from_colour, DEPTH_SCALE_SIGMA
-        found.covariance = _with_scale_sigma(refined.covariance, poses, sigma, replaced=False)
+        found.covariance = add_scale_sigma(refined.covariance, poses, sigma, replaced=False)
         before, after = refined.surfaces_mm
         log.info("surfaces: %.1f to %.1f mm apart", before, after)
 

@@ -1,4 +1,4 @@
-"""Scale of a rig without depth and without a board: from the subject's height."""
+"""Scale of a rig: by a measured distance or the subject's height; check of a board by depth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ import numpy as np
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.body.loading import load_body_file
+from intercap_core.calibrate.evidence import CORNERS, JOINTS, Views
+from intercap_core.calibrate.found_rig import FoundRig
+from intercap_core.calibrate.placement import board_pose, reference_points
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.boards import Board
+from intercap_core.geometry.camera.rig import Rig
 
 _SEGMENTS = [
     (f"{side}_{a}", f"{side}_{b}")
@@ -21,6 +27,8 @@ _SEGMENTS = [
 UPRIGHT, BUILD_SIGMA = 0.97, 0.025
 HEIGHT_M, HEIGHT_SIGMA_M = 1.70, 0.095  # of adults of both sexes (NCD-RisC, eLife 2016), if unknown
 STATED_SIGMA_M = 0.02  # of a stated height, as in the table of subjects
+
+MAX_BOARD_FACTOR = 0.05  # by which a board's size may contradict the depth
 
 
 def scale_by_height(joints: np.ndarray, height_m: float | None) -> tuple[float, float]:
@@ -60,3 +68,77 @@ def scale_by_height(joints: np.ndarray, height_m: float | None) -> tuple[float, 
     sigma = STATED_SIGMA_M if height_m else HEIGHT_SIGMA_M
     scale = float(np.mean(ways)) * height if ways else float("nan")
     return scale, float(np.hypot(BUILD_SIGMA, sigma / height))
+
+
+def rescale(
+    found: FoundRig,
+    views: Views,
+    distance: tuple[str, str, float] | None,
+    height_m: float | None,
+) -> None:
+    """Scale the rig by a stated distance or by the subject's height, in place."""
+    rig, names = found.rig, found.rig.names
+    if distance is not None:
+        for name in distance[:2]:
+            if name not in names:
+                known = ", ".join(names)
+                raise UserError(f"--distance names camera {name!r}; expected one of {known}")
+        a, b = (rig.master_from_colour[names.index(name), :3, 3] for name in distance[:2])
+        scale, sigma = distance[2] / float(np.linalg.norm(a - b)), 0.005 / distance[2]  # 5 mm
+        found.scale = f"the stated distance between {distance[0]} and {distance[1]}"
+    else:
+        joints = reference_points(rig, views, list(range(len(rig))), None)[:, JOINTS]
+        scale, sigma = scale_by_height(joints, height_m)
+        if not np.isfinite(scale):
+            raise UserError(
+                "nothing determines the scale: the person's limbs are not seen; state the distance "
+                "of two cameras (--distance k1:k2:METRES) or show a board"
+            )
+        stated = f"{height_m:.2f} m" if height_m else "unknown, taken as 1.70 m"
+        found.scale = f"the subject's height ({stated})"
+        if not height_m:
+            found.notes.append(
+                f"the scale is known to {100 * sigma:.0f} % only: state the subject's height in "
+                "the table of subjects, or the distance of two cameras (--distance)"
+            )
+    poses = rig.master_from_colour.copy()
+    poses[:, :3, 3] *= scale
+    covariance = found.covariance.copy()
+    covariance[:, 3:] *= scale
+    covariance[:, :, :, 3:] *= scale
+    found.rig, found.walk = rig.moved(poses), scale * found.walk
+    found.covariance = add_scale_sigma(covariance, poses, sigma, replaced=True)
+
+
+def add_scale_sigma(
+    covariance: np.ndarray, poses: np.ndarray, sigma: float, *, replaced: bool
+) -> np.ndarray:
+    """Covariance (C, 6, C, 6) with a relative standard deviation of the scale.
+
+    ``replaced``: the scale's own variance is first removed, as if it were known exactly.
+    """
+    steps = np.zeros((len(poses), 6))
+    steps[:, 3:] = poses[:, :3, 3]
+    way, flat = steps.ravel(), covariance.reshape(6 * len(poses), -1)
+    if replaced:
+        coupled = flat @ way
+        flat = flat - np.outer(coupled, coupled) / max(float(way @ coupled), 1e-12)
+    return (flat + sigma**2 * np.outer(way, way)).reshape(covariance.shape)
+
+
+def check_board_size(rig: Rig, views: Views, board: Board) -> None:
+    """Raise UserError if depth contradicts the board's size."""
+    ratios = []
+    for t, c in np.argwhere(np.isfinite(views.distance[:, :, CORNERS]).any(2)).tolist():
+        pose = board_pose(rig[c], board, views.pixels[t, c, CORNERS])
+        if pose is not None:
+            away = np.linalg.norm(board.corners @ pose[:3, :3].T + pose[:3, 3], axis=1)
+            ratios.append(np.nanmedian(views.distance[t, c, CORNERS] / away))
+    if len(ratios) < 5:
+        return
+    ratio = float(np.median(ratios))
+    if abs(ratio - 1) > MAX_BOARD_FACTOR:
+        raise UserError(
+            f"by the depth, the board is {ratio:.2f} times as large as --board states (or the "
+            "depth's unit is wrong); measure a square on the printed board and correct --board"
+        )

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.calibrate.draft import RigDraft, draft_rig, write_calibration
-from intercap_core.calibrate.rig_poses import WEAK_M, FoundRig, find_poses
+from intercap_core.calibrate.found_rig import WEAK_M, FoundRig
+from intercap_core.calibrate.rig_poses import find_poses
 from intercap_core.commands.console import ListTable, print_plain, standard_console
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
@@ -48,6 +49,13 @@ def calibrate(
     parsed_board = None if board is None else parse_board(board)
     parsed_distance = None if distance is None else _parse_distance(distance)
     draft = draft_rig(row, lenses, master)
+    used = project.config.frames.cameras
+    left_out = [name for name in draft.names if used and name not in used]
+    if left_out:
+        raise UserError(
+            f"{project.path}: frames.cameras leaves out {', '.join(left_out)}, and calibrate finds "
+            "the poses of all recorded cameras; remove the setting, or their recordings"
+        )
     paths = record(project, row, draft, recordings)
     found = find_poses(
         paths,
@@ -57,13 +65,14 @@ def calibrate(
         without_lens=draft.without_lens,
         keep_lenses=draft.content is None,
     )
-    order = [found.rig.names.index(name) for name in draft.names]
-    write_calibration(path, _with_lenses(draft, found), found.rig.master_from_colour[order])
     with Frames.open(paths[0][0]) as frames:
         up = rough_up(found.rig, frames.gravity).direction
     rows, advice = _rows(found), advise(found)
     page = project.results / "calibrate" / sequence / "calibration.html"
-    page.write_text(calibration_page(sequence, found, up, rows, advice), encoding="utf-8")
+    html = calibration_page(sequence, found, up, rows, advice)
+    order = [found.rig.names.index(name) for name in draft.names]
+    write_calibration(path, _with_lenses(draft, found), found.rig.master_from_colour[order])
+    page.write_text(html, encoding="utf-8")
     _print(rows, found, advice)
     return path, page
 
@@ -81,7 +90,7 @@ def record(
         folders: further recordings with the same layout and cameras, without keypoints.
 
     Returns:
-        Paths of both artefacts, of the row first; None = people are not detected.
+        Paths of both artefacts, of the row first; None = without detections.
     """
     places = project.results / "calibrate"
     in_a_row = np.tile(np.eye(4), (len(draft.names), 1, 1))
@@ -115,7 +124,7 @@ def _parse_distance(text: str) -> tuple[str, str, float]:
         first, second, metres = names[0], names[1], float(names[2])
     except (IndexError, ValueError):
         metres = 0.0
-    if not (metres > 0 and len(names) == 3):
+    if len(names) != 3 or not 0 < metres < np.inf or first == second:
         raise UserError(
             f"--distance {text!r}: expected CAMERA:CAMERA:METRES, for example k1:k2:2.35"
         )

@@ -37,7 +37,11 @@ def views_of_walker(
         distance = np.linalg.norm(joints[:, None] - eyes, axis=-1)
         distance += 0.005 * noise_px * rng.standard_normal(distance.shape)
     nothing = np.zeros(sets, int)
-    return rig, joints, Views(times, nothing, pixels, seen[..., 2], distance)
+    return (
+        rig,
+        joints,
+        Views(times, nothing, pixels, seen[..., 2], distance, np.zeros((1, len(rig)), int)),
+    )
 
 
 def with_board(

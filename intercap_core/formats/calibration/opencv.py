@@ -72,12 +72,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
 
     Raises UserError naming file, camera and field if something is missing or impossible.
     """
-    if path.is_dir():
-        suffixes = (".json", ".yaml", ".yml")
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
-        content: dict[str, Any] = {"cameras": {file.stem: load_opencv(file) for file in files}}
-    else:
-        content = load_opencv(path)
+    content = read_content(path)
     entries = content.get("cameras")
     if not isinstance(entries, dict) or not entries:
         raise UserError(
@@ -102,6 +97,18 @@ def read_opencv_calibration(path: Path) -> Calibration:
         cameras[name] = _camera(entry, where, fps, unit)
         poses[name] = _pose(entry, where, path, is_master=name == master)
     return Calibration(cameras, relate_to_master(path, master, poses))
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """Content of a calibration file, or of a folder with one file a camera as such a file.
+
+    Raises UserError as :func:`load_opencv`.
+    """
+    if not path.is_dir():
+        return load_opencv(path)
+    suffixes = (".json", ".yaml", ".yml")
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
+    return {"cameras": {file.stem: load_opencv(file) for file in files}}
 
 
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:

@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from intercap_core.calibrate.rig_poses import FoundRig
+from intercap_core.calibrate.found_rig import FoundRig
 from intercap_core.output.site import embed
 from intercap_core.output.site.capture_pictures import camera_colour
 

@@ -1,0 +1,85 @@
+"""Result of a calibration: the poses of a rig, their covariance, and the agreement of cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from intercap_core.calibrate.adjust import JointTerm
+from intercap_core.calibrate.evidence import CORNERS, JOINTS, Views
+from intercap_core.calibrate.lenses import LensEstimate
+from intercap_core.geometry.camera.rig import Rig, ring_centre
+from intercap_core.scene.camera_verdicts import weakest_motion
+
+WEAK_M = 0.03  # standard deviation at the rig's centre from which a camera is called weak
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """How well two cameras agree."""
+
+    cameras: tuple[int, int]
+    joints: int
+    """Number of joints that both see at one time."""
+    boards: int
+    """Number of sets in which both see the board."""
+    error_px: float
+    """Median reprojection error of these joints in both, pixels of a 1080p image; NaN = none."""
+
+
+@dataclass(eq=False)
+class FoundRig:
+    """Poses of a rig and what they rest on."""
+
+    rig: Rig
+    """The cameras at their found poses, the master first."""
+    covariance: np.ndarray
+    """(C, 6, C, 6) of rotations about the cameras' centres, rad, and translations, metres."""
+    joint_error_px: np.ndarray
+    """(C,) median reprojection error of joints, pixels of a 1080p image; NaN = none."""
+    corner_error_px: np.ndarray
+    """(C,) the same of the board's corners."""
+    joints: np.ndarray
+    """(C,) number of joints seen together with another camera."""
+    boards: np.ndarray
+    """(C,) number of sets in which the camera sees the board."""
+    lags: np.ndarray
+    """(C,) sets by which the images of the first recording are late."""
+    pairs: list[Pair]
+    walk: np.ndarray
+    """(T, 3) middle of the person's hips, master frame, metres; NaN = unknown."""
+    scale: str
+    """What determines the scale."""
+    notes: list[str] = field(default_factory=list)
+    new_lenses: dict[str, LensEstimate] = field(default_factory=dict)
+    """Estimated or refined lenses by camera."""
+
+    def sigma_m(self, camera: int) -> float:
+        """Standard deviation of the rig's centre as the camera sees it, in its worst direction."""
+        pose = self.rig.master_from_colour[camera]
+        block = self.covariance[camera, :, camera]
+        return weakest_motion(block, pose, ring_centre(self.rig))[0]
+
+
+def count_shared_joints(views: Views) -> np.ndarray:
+    """Number (C,) of joints that each camera sees together with another one."""
+    seen = views.confidence[:, :, JOINTS] > 0
+    return (seen & (seen.sum(1, keepdims=True) >= 2)).sum((0, 2))
+
+
+def compare_pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
+    """Agreement of every pair of cameras with common joints or boards."""
+    seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
+    boards = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
+    sizes = joints.sizes_px(rig.master_from_colour)
+    pairs = []
+    for a, b in combinations(range(len(rig)), 2):
+        own = sizes[:, [a, b]]
+        own = own[np.isfinite(own).all(1)]
+        error = float(np.median(own)) if len(own) else np.nan
+        common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
+        if any(common):
+            pairs.append(Pair((a, b), *common, error))
+    return pairs
