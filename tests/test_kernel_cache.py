@@ -62,6 +62,8 @@ def python(package: Path, code: str, **variables: str) -> subprocess.CompletedPr
             **kept,
             "PYTHONPATH": str(package.parent),
             "XDG_CACHE_HOME": str(package.parent / "cache"),
+            # bytecode is checked by size and whole seconds, which these edits may not change
+            "PYTHONDONTWRITEBYTECODE": "1",
             **variables,
         },
         cwd=package.parent,
