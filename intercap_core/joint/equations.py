@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 
-from intercap_core.geometry.solve.banded import BandedSystem
+from intercap_core.geometry.solve.banded import solve_banded
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.state import ALL
 
@@ -26,7 +25,7 @@ class BandedEquations:
     """Sums of weighted J^T J and J^T r of all terms, by the n = 174 unknowns of T frames.
 
     Attributes:
-        bands: (w+1, T, n, n) blocks of J^T J as in :class:`BandedSystem`: ``bands[d, t]`` couples
+        bands: (w+1, T, n, n) blocks of J^T J as in :func:`solve_banded`: ``bands[d, t]`` couples
             frame t + d with frame t. w = 2, less for recordings of one or two frames.
         damped: (T, n) diagonal of J^T J to which the damping is relative. It omits stiff rows:
             damping by their large values would freeze an object that has to move as one over many
@@ -70,19 +69,19 @@ class BandedEquations:
 
         See :meth:`solve` for ``damping``.
         """
-        return self.solve(damping, -self.gradient)
+        step = self.solve(damping, -self.gradient[..., None])
+        return None if step is None else step[..., 0]
 
     def solve(self, damping: np.ndarray, right: np.ndarray) -> np.ndarray | None:
-        """The solution for one or k right-hand sides (T, n) or (T, n, k); None as in :meth:`step`.
+        """The solutions for k right-hand sides (T, n, k); None as in :meth:`step`.
 
         ``damping`` (T,) times ``damped`` is added to the diagonal. The solution consumes ``bands``
         to save memory: another one needs new equations.
         """
-        matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
-        damped = torch.from_numpy(damping[:, None] * self.damped)
-        matrix[0].diagonal(dim1=1, dim2=2).add_(damped)
-        factor = BandedSystem(matrix).factorise(in_place=True)
-        return None if factor is None else factor.solve(torch.from_numpy(right)).numpy()
+        matrix, self.bands = self.bands, np.zeros((0, 0, 0, 0))
+        each = np.arange(matrix.shape[-1])
+        matrix[0][:, each, each] += damping[:, None] * self.damped
+        return solve_banded(matrix, right)
 
     @property
     def energy(self) -> dict[str, float]:

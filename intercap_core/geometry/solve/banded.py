@@ -4,83 +4,104 @@ A system has T frames with n parameters each. Frame t is coupled with frames up 
 without temporal terms, 1 with velocities, 2 with accelerations. Its matrix (T n x T n) is
 block-banded, symmetric and positive definite. The block Cholesky factorisation over time takes
 O(T (w + 1)^2 n^3) operations and O(T (w + 1) n^2) memory.
+
+Parameters that are not coupled with other frames are eliminated first within each frame. Their rows
+and columns are then zero in the factor's blocks between frames too, so that these blocks are
+computed and stored without them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import torch
-from scipy.linalg import get_blas_funcs
-from torch import Tensor
+import numpy as np
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 
-@dataclass(frozen=True)
-class BandedSystem:
-    """Blocks of a symmetric matrix."""
+def solve_banded(bands: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    """Return the solutions x (T, n, k), or None if the matrix is not positive definite.
 
-    bands: Tensor
-    """(w+1, T, n, n): ``bands[k, t]`` is block (t + k, t), rows of frame t + k, columns of frame t.
-    ``bands[0]`` is symmetric, and the last k entries of ``bands[k]`` are not read."""
-
-    def __post_init__(self) -> None:
-        w1, t, n, n2 = self.bands.shape
-        if n != n2 or w1 > t:
-            raise ValueError(f"bands have shape {tuple(self.bands.shape)}, expected (w+1, T, n, n)")
-
-    def factorise(self, *, in_place: bool = False) -> BandedFactor | None:
-        """Return the Cholesky factor, or None if the matrix is not positive definite.
-
-        ``in_place`` overwrites ``bands`` by the factor.
-        """
-        lower = self.bands if in_place else self.bands.clone()
-        w1, count = lower.shape[:2]
-        if w1 == 1:
-            lower[0], info = torch.linalg.cholesky_ex(lower[0])
-            return None if bool(info.any()) else BandedFactor(lower)
-        (syrk,) = get_blas_funcs(("syrk",), dtype=lower.numpy().dtype)
-        for t in range(count):
-            # lower[k, t - k] is block (t, t - k); finish row t from its farthest column on
-            for k in range(min(w1 - 1, t), 0, -1):
-                block = lower[k, t - k]
-                for j in range(k + 1, min(w1 - 1, t) + 1):
-                    block -= lower[j, t - j] @ lower[j - k, t - j].T
-                lower[k, t - k] = torch.linalg.solve_triangular(
-                    lower[0, t - k].T, block, upper=True, left=False
-                )
-            own = lower[0, t].numpy()
-            for k in range(1, min(w1 - 1, t) + 1):
-                # only the lower triangle, which cholesky_ex reads; BLAS stores by columns
-                rows = lower[k, t - k].numpy()
-                own = syrk(-1.0, rows.T, beta=1.0, c=own.T, trans=1, overwrite_c=1).T
-            lower[0, t], info = torch.linalg.cholesky_ex(torch.from_numpy(own))
-            if bool(info):
-                return None
-        return BandedFactor(lower)
+    Args:
+        bands: (w+1, T, n, n), C-contiguous: ``bands[k, t]`` is block (t + k, t), rows of frame
+            t + k, columns of frame t. The last k entries of ``bands[k]`` are not read. The factor
+            overwrites them.
+        right: (T, n, k) right-hand sides.
+    """
+    w1, count, n, n2 = bands.shape
+    if n != n2 or w1 > count:
+        raise ValueError(f"bands have shape {bands.shape}, expected (w+1, T, n, n)")
+    order, starts = _elimination(bands)
+    lower = [_arrange(band, order[start:]) for band, start in zip(bands, starts, strict=True)]
+    if not _factorise(lower):
+        return None
+    x = np.empty_like(right, bands.dtype)
+    x[:, order] = _substitute(lower, np.ascontiguousarray(right[:, order], bands.dtype))
+    return x
 
 
-@dataclass(frozen=True)
-class BandedFactor:
-    """Cholesky factor of a :class:`BandedSystem`."""
+def _elimination(bands: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Return the order of elimination (n,), and the first of its parameters in each band.
 
-    lower: Tensor
-    """(w+1, T, n, n), laid out as `BandedSystem.bands`."""
+    Parameters are in order of the farthest frame with which they are coupled. Products of blocks
+    fill the entries of all parameters with any coupling, except in the last band.
+    """
+    w1, count, n, _ = bands.shape
+    reach = np.zeros(n, int)
+    for k in range(1, w1):
+        coupled = (bands[k, : count - k] != 0).any(axis=0)
+        reach[coupled.any(axis=0) | coupled.any(axis=1)] = k
+    first = [0, *([int((reach < 1).sum())] * (w1 - 2)), int((reach < w1 - 1).sum())]
+    return np.argsort(reach, kind="stable"), first[-w1:]
 
-    def solve(self, right: Tensor) -> Tensor:
-        """Return the solutions x (T, n) or (T, n, k) for one or k right-hand sides."""
-        if right.ndim == 2:
-            return self.solve(right[..., None])[..., 0]
-        lower = self.lower
-        w1, count = lower.shape[:2]
-        if w1 == 1:
-            return torch.cholesky_solve(right, lower[0])
-        x = right.clone()
-        for t in range(count):
-            for k in range(1, min(w1 - 1, t) + 1):
-                x[t] -= lower[k, t - k] @ x[t - k]
-            x[t] = torch.linalg.solve_triangular(lower[0, t], x[t], upper=False)
-        for t in reversed(range(count)):
-            for k in range(1, min(w1 - 1, count - 1 - t) + 1):
-                x[t] -= lower[k, t].T @ x[t + k]
-            x[t] = torch.linalg.solve_triangular(lower[0, t].T, x[t], upper=True)
-        return x
+
+def _arrange(band: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Move rows and columns ``chosen`` (m,) of blocks (T, n, n) to (T, m, m) in the same memory."""
+    count, n, _ = band.shape
+    size = len(chosen) ** 2
+    index = (n * chosen[:, None] + chosen).ravel()
+    for block in band.reshape(count, -1):
+        block[:size] = np.take(block, index)
+    return band.reshape(count, -1)[:, :size].reshape(count, len(chosen), len(chosen))
+
+
+def _factorise(lower: list[np.ndarray]) -> bool:
+    """Overwrite bands by their Cholesky factor; False if the matrix is not positive definite.
+
+    Band k holds (T, m, m) blocks of the last m parameters. BLAS stores by columns, so that it reads
+    a transposed block: the factor's lower triangle as an upper one.
+    """
+    own = lower[0]
+    n = own.shape[1]
+    (trsm,) = get_blas_funcs(("trsm",), dtype=own.dtype)
+    (potrf,) = get_lapack_funcs(("potrf",), dtype=own.dtype)
+    for t in range(len(own)):
+        # lower[k][t - k] is block (t, t - k); finish row t from its farthest column on
+        for k in range(min(len(lower) - 1, t), 0, -1):
+            block = lower[k][t - k]
+            m = len(block)
+            for j in range(k + 1, min(len(lower) - 1, t) + 1):
+                far, near = lower[j][t - j], lower[j - k][t - j]
+                product = far @ near[:, len(near) - len(far) :].T
+                block[m - len(far) :, m - len(near) :] -= product
+            trsm(1.0, own[t - k, n - m :, n - m :].T, block.T, trans_a=1, overwrite_b=1)
+            own[t, n - m :, n - m :] -= block @ block.T  # of which numpy computes one triangle
+        _, info = potrf(own[t].T, clean=0, overwrite_a=1)
+        if info:
+            return False
+    return True
+
+
+def _substitute(lower: list[np.ndarray], x: np.ndarray) -> np.ndarray:
+    """Overwrite right-hand sides (T, n, k) by the solutions, by a factor of :func:`_factorise`."""
+    own = lower[0]
+    count, n, _ = x.shape
+    (trsm,) = get_blas_funcs(("trsm",), dtype=x.dtype)
+    for t in range(count):
+        for k in range(1, min(len(lower) - 1, t) + 1):
+            first = n - lower[k].shape[1]
+            x[t, first:] -= lower[k][t - k] @ x[t - k, first:]
+        trsm(1.0, own[t].T, x[t].T, side=1, overwrite_b=1)
+    for t in reversed(range(count)):
+        for k in range(1, min(len(lower) - 1, count - 1 - t) + 1):
+            first = n - lower[k].shape[1]
+            x[t, first:] -= lower[k][t].T @ x[t + k, first:]
+        trsm(1.0, own[t].T, x[t].T, side=1, trans_a=1, overwrite_b=1)
+    return x
