@@ -237,6 +237,8 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
     rays are not needed: the ball around a point whose radius is its distance contains no surface,
     so all of it is on one side. A point is on the same side as a previous point if it is within
     that point's ball or its own ball contains that point. A ray is cast only for other points.
+    Outside of the mesh, a point that lies deeper than ``reach`` in a previous ball needs no search,
+    nor does one that is farther than ``reach`` from the mesh's box.
     """
     signed = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
@@ -246,24 +248,22 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
     reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
-        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+        finite = np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
+        if not (finite and _to_box(x, y, z, boxes, 0) < reach_sq):
             signed[m] = reach
             continue
-        square, last = _search(x, y, z, triangles, boxes, levels, reach_sq, last, stack, ahead)
-        far = not square < reach_sq
-        distance = reach if far else np.sqrt(np.float64(square))
         off = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+        if not within and off < clear - reach - _ROUNDING:
+            signed[m] = reach
+            continue
+        square, last = _search(x, y, z, triangles, boxes, levels, deepest_sq, last, stack, ahead)
+        distance = np.sqrt(np.float64(square)) if square < deepest_sq else deepest
         if not off < max(distance, clear) - _ROUNDING:
             within = _odd(x, y, z, triangles, boxes, levels, stack)
             clear = -np.inf
         if distance > clear - off:  # this point's ball leaves more room around it
             cx, cy, cz, clear = np.float64(x), np.float64(y), np.float64(z), distance
-        if within and far:
-            square, last = _search(
-                x, y, z, triangles, boxes, levels, deepest_sq, last, stack, ahead
-            )
-            distance = np.sqrt(np.float64(square)) if square < deepest_sq else deepest
-        signed[m] = -distance if within else distance
+        signed[m] = -distance if within else min(distance, reach)
     return signed
 
 
