@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from intercap_core.artefacts import RowStream, Writer
 from intercap_core.evaluation import contact
 from intercap_core.evaluation.proximity import (
     REACH_M,
@@ -31,7 +32,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface, vertex_normals
 from intercap_core.progress import Progress
-from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS
+from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS, PER_VERTEX_METRICS
 
 log = logging.getLogger(__name__)
 
@@ -102,17 +103,24 @@ class Measurement:
         self.tree = SurfaceTree(template, self.faces)
         self.body_samples = sample_surface(template, self.faces, 4000)
 
-    def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
-        """Values by dataset of the metrics artefact.
+    def over_frames(
+        self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None, writer: Writer
+    ) -> Values:
+        """Values by dataset of the metrics artefact, without ``PER_VERTEX_METRICS``.
+
+        These grow with the recording, so that ``writer`` appends them frame by frame.
 
         With truth, also ``true_distance`` (T, V): signed distances of the true body's vertices from
-        the true object, and ``true_facing`` (T, V): their contact distances.
+        the true object, ``true_facing`` (T, V): their contact distances, and ``facing`` (T, V):
+        contact distances of the fitted body.
 
         Args:
             floor: point (3,) and unit normal (3,) of the floor; NaN = unknown.
             truth: true body and object; None = unknown.
+            writer: of the metrics artefact.
         """
         values: Values = {}
+        streams: dict[str, RowStream] = {}
         handled = self.handled
         counts = np.zeros(len(handled.points) if handled else 0, np.int32)
         true_points = seen = true_surface = None
@@ -144,24 +152,25 @@ class Measurement:
                 row |= self._true_object(
                     t, truth, true_surface, true_points, clouds[1], seen_object
                 )
+            for key in sorted(PER_VERTEX_METRICS & row.keys()):
+                value = row.pop(key)
+                if key not in streams:
+                    streams[key] = writer.stream(key, value.shape)
+                streams[key].append(value[None])
+                if truth is not None and key == "body_contact_distance":
+                    row["facing"] = value
             for key, value in row.items():
                 if key not in values:
-                    # single precision, since distances by vertex fill the memory
-                    kind = np.float32 if np.ndim(value) else np.asarray(value).dtype
+                    kind = np.asarray(value).dtype
                     values[key] = np.empty((len(self.body.joints), *np.shape(value)), kind)
                 values[key][t] = value
             progress.step()
         if handled is None:
             return values
-        touching = contact.vertex_contact(values["body_contact_distance"], self.threshold)
         return values | {
             "object_sample_points": handled.points,
             "object_sample_contact": counts,
-            "contact_frame": touching.any(1),
             "region_names": CONTACT_REGIONS,
-            "region_contact": contact.region_contact(
-                touching, self.body.model.regions, CONTACT_REGIONS
-            ),
         }
 
     def _between(
@@ -200,13 +209,17 @@ class Measurement:
             [len(points)],
         )
         depth = contact.depths(to_object)
+        facing = surface.facing(placed, to_object, contact.facing_reach(self.threshold))
+        touching = contact.vertex_contact(facing.astype(np.float32), self.threshold)
         return {
-            "body_to_object": to_object,
-            "object_to_body": to_body,
-            "body_contact_distance": surface.facing(
-                placed, to_object, contact.facing_reach(self.threshold)
+            "body_to_object": to_object.astype(np.float32),
+            "object_to_body": to_body.astype(np.float32),
+            "body_contact_distance": facing.astype(np.float32),
+            "object_contact_distance": np.minimum(of_vertices, REACH_M).astype(np.float32),
+            "contact_frame": touching.any(),
+            "region_contact": contact.region_contact(
+                touching, self.body.model.regions, CONTACT_REGIONS
             ),
-            "object_contact_distance": np.minimum(of_vertices, REACH_M),
             "penetration_mean": depth.mean,
             "penetration_median": depth.median,
             "penetration_max": depth.max,

@@ -61,12 +61,13 @@ def run(
     ):
         made_by = {k: v for k, v in fitted.attributes.items() if k == "made_by"}
         rig = Rig.from_artefact(setting).moved(fitted["master_from_colour"])
-    # Clouds, truth and distances grow with the recording and are released before the verdict. Rig
-    # and body are not: their cached ray tables are used again.
-    values, flags, attributes = _measure(paths, models, settings, truth, rig, body_track)
-    with artefacts.write(
-        output, METRICS, settings_digest=digest(settings), **attributes, **made_by
-    ) as writer:
+    with artefacts.write(output, METRICS, settings_digest=digest(settings), **made_by) as writer:
+        # Clouds and truth grow with the recording and are released before the verdict. Rig and body
+        # are not: their cached ray tables are used again.
+        values, flags, attributes = _measure(
+            paths, models, settings, truth, rig, body_track, writer
+        )
+        writer.attributes.update(attributes)
         for key in sorted(values):
             writer.put(key, values.pop(key))
         flags.write(writer)
@@ -84,10 +85,12 @@ def _measure(
     truth: Path | None,
     rig: Rig,
     body_track: BodyTrack,
+    writer: artefacts.Writer,
 ) -> tuple[Values, Flags, dict[str, object]]:
     """Datasets of the metrics artefact except the verdict, its flags and its attributes.
 
-    ``rig`` and ``body_track`` are those of the joint fit.
+    Distances by vertex are not returned but appended to ``writer``. ``rig`` and ``body_track`` are
+    those of the joint fit.
     """
     object_, body_models, gender = models.object_, models.body_models, models.gender
     mesh = None if object_ is None else ObjectMesh.load(object_)
@@ -107,9 +110,11 @@ def _measure(
         if mesh is not None and object_track.known:
             handled = HandledObject(mesh, object_track)
         measured = Measurement(handled, body_track, clouds, rig, settings.contact_mm * 1e-3)
-        values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
-        true_distance = values.pop("true_distance", None)
-        true_facing = values.pop("true_facing", None)
+        ground = setting["ground_point"], setting["ground_normal"]
+        values = measured.over_frames(ground, known, writer)
+        true_distance, true_facing, facing = (
+            values.pop(key, None) for key in ("true_distance", "true_facing", "facing")
+        )
         _warn_of_foreign_truth(truth, values)
         values |= _motion(body_track, handled, images.fps)
         if handled is not None:
@@ -123,9 +128,7 @@ def _measure(
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
             values |= errors.of_object("joint", object_track)
-            values |= errors.of_body(
-                "joint", body_track, object_track, values.get("body_contact_distance")
-            )
+            values |= errors.of_body("joint", body_track, object_track, facing)
             values |= errors.about_truth(body_track.model.regions) | _extrinsics_errors(
                 setting, fitted["master_from_colour"], known
             )
