@@ -13,7 +13,7 @@ from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.carrying import HandleCarry
 from intercap_core.studio.interactions.drinking import Drinking
 from intercap_core.studio.interactions.football_kick import FootballKick
-from intercap_core.studio.interactions.presenting import Checking, PassingOn
+from intercap_core.studio.interactions.presenting import Checking, PassingOn, Turning
 from intercap_core.studio.interactions.sitting import ChairSit, StoolSit
 from intercap_core.studio.interactions.skateboard_ride import SkateboardRide
 from intercap_core.studio.interactions.slipping import GlidingSwing, Regrasp, TurningSwing
@@ -28,6 +28,16 @@ def _script(base: type[Interaction], object_class: str, **values: Any) -> type[I
 BY_THE_WALL = dict(top_of_height=0.555, aside=-0.10)
 BOTTLE_CHECK = dict(
     **BY_THE_WALL, grip_height_m=0.01, before_eyes=(0.06, -0.42, 0.64), tip_deg=20.0
+)
+IN_ONE_HAND = dict(
+    **BY_THE_WALL,
+    before_eyes=(0.05, -0.50, 0.75),
+    turns_deg=((-70, 0, 0), (0, -30, 15), (70, 0, 0), (0, 25, -20)),
+)
+BETWEEN_PALMS = dict(
+    grip_height_m=None,
+    before_eyes=(0.0, -0.70, 0.95),
+    turns_deg=((65, 0, 0), (0, -30, 0), (-65, 0, 0), (0, 25, 0)),
 )
 # Each key has the wrist's place, the directions of fingers and thumb, and start and end.
 RACQUET = dict(  # a forehand: back, through the ball's place at the right, over the left shoulder
@@ -89,6 +99,14 @@ INTERACTIONS: dict[str, type[Interaction]] = {
         knuckles_aside=(0.020, 0.030, 0.040), knuckles_below=(0.022, 0.028, 0.034, 0.040),
         lifted_s=1.70, lower_s=1.80, stoop_from=0.28, stoop_down=0.50, stoop_back=0.08,
         stoop_bend=0.62,
+    ),
+    "bottle_scan": _script(Turning, "bottle", **IN_ONE_HAND, grip_height_m=0.01),
+    "cup_scan": _script(Turning, "cup", **IN_ONE_HAND),
+    "suitcase_scan": _script(Turning, "suitcase", **BETWEEN_PALMS, top_of_height=0.25),
+    "chair_scan": _script(  # its back is away from the person, the palms near its front edge
+        Turning, "chair", **BETWEEN_PALMS | dict(before_eyes=(0.0, -0.75, 1.0)),
+        top_of_height=0.20, plinth_half_m=0.24, plinth_ahead_m=0.20, prop_heading_deg=-85.0,
+        palms_m=(-0.15, 0.0, -0.01),
     ),
     "walk_and_wave": WalkAndWave,
     "beam_walk": BeamWalk,

@@ -43,6 +43,9 @@ class HandlingScript(Interaction):
     lead = RIGHT
     # height of the palm above the object's origin, metres; None: held between both palms
     grip_height_m: float | None = 0.0
+    # of an object between both palms: where the palms begin to move outward to its surface, ahead
+    # of its origin, to the side and above it, metres
+    palms_m = (0.0, 0.0, -0.01)
     attach_s: float  # grasp, script time
     release_s: float  # release, script time
     # just before and after a grip, the open hand is this far off the object, metres:
@@ -54,6 +57,9 @@ class HandlingScript(Interaction):
     # an approaching or leaving hand passes this far above, metres
     over_m = np.array([0.0, 0.0, 0.10])
     plinth_half_m = 0.17  # half the side of a plinth, metres
+    plinth_ahead_m = 0.38  # from where the person stands to the plinth, metres
+    prop_ahead_m = 0.46  # from where the person stands to the object on the plinth, metres
+    prop_heading_deg = 95.0  # of the object on the plinth
     fingers_rest_m = 0.004  # a hand stays this far above a table, metres
 
     def __post_init__(self) -> None:
@@ -137,11 +143,14 @@ class HandlingScript(Interaction):
         rng, puppet = self.rng, self.puppet
         self.top = top_of_height * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
         self.table(
-            (0.38 + self.plinth_half_m, aside), (self.plinth_half_m, self.plinth_half_m), self.top
+            (self.plinth_ahead_m + self.plinth_half_m, aside),
+            (self.plinth_half_m, self.plinth_half_m),
+            self.top,
         )
         self.pick_pose = upright(
-            0.46 + rng.uniform(0, 0.03), aside - 0.01 + rng.uniform(-0.03, 0.03),
-            self.top + self.prop.standing_height, np.radians(95) + rng.normal(0, 0.15),
+            self.prop_ahead_m + rng.uniform(0, 0.03), aside - 0.01 + rng.uniform(-0.03, 0.03),
+            self.top + self.prop.standing_height,
+            np.radians(self.prop_heading_deg) + rng.normal(0, 0.15),
         )  # fmt: skip
         self.place_pose = upright(
             self.pick_pose[0, 3] + rng.uniform(-0.01, 0.04),
@@ -255,7 +264,8 @@ def between_palms(script: HandlingScript) -> dict[int, Grip]:
     grips = {}
     for side in SIDES:
         inward = (-1.0, 1.0)[side]
-        at = script.pick_pose[:3, 3] - (0.0, 0.0, 0.01)  # palms below the object's middle
+        ahead, aside, up = script.palms_m
+        at = script.pick_pose[:3, 3] + (ahead, -inward * aside, up)
         approach = Approach(at, np.array([0.9, 0.25 * inward, -0.35]),
                             np.array([0.15, inward, 0.18]),
                             floor=script.top + HandlingScript.fingers_rest_m)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Take an object from a plinth and turn it before the eyes, or pass it to another plinth.
+"""Take an object from a plinth and turn it before the eyes or chest, or pass it to another plinth.
 
 Conventions of numbers, columns and frames: :mod:`.base`.
 """
@@ -6,6 +6,7 @@ Conventions of numbers, columns and frames: :mod:`.base`.
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.interactions.base import upright
@@ -31,6 +32,10 @@ class Checking(HandlingScript):
     join_s = 1.56  # the second hand takes hold, script time
     part_s = 1.96  # the second hand lets go, script time
     raised_s = (1.36, 2.12)  # start and end of the turning before the eyes, script time
+    # leaning to the plinth, to pick up and to put down, and looking at the object: times as
+    # :func:`plateau` takes them, script time
+    lean_s = ((0.35, 0.9, 1.0, 1.5), (2.0, 2.45, 2.55, 3.0))
+    look_s = (1.1, 1.5, 2.0, 2.4)
 
     def plan(self) -> None:
         self.set_out(self.top_of_height, self.aside)
@@ -44,8 +49,8 @@ class Checking(HandlingScript):
 
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the plinth, straighten up, look at the object, lean again."""
-        reach = plateau(times, 0.35, 0.9, 1.0, 1.5) + plateau(times, 2.0, 2.45, 2.55, 3.0)
-        look = plateau(times, 1.1, 1.5, 2.0, 2.4)
+        reach = plateau(times, *self.lean_s[0]) + plateau(times, *self.lean_s[1])
+        look = plateau(times, *self.look_s)
         trunk = self.leaning(times, reach, 0.30 * reach + 0.22 * look)
         trunk.bend[:, 1] -= 0.06 * self.order[0] * bump(times, 1.2, 2.2)
         return trunk
@@ -54,18 +59,22 @@ class Checking(HandlingScript):
         """The helping arm's elbow is away from the body while its hand is before the chest."""
         return (0.4 * plateau(times, 0.9, 1.3, 2.0, 2.4), np.zeros(len(times)))[side]
 
+    def turned(self, times: np.ndarray) -> np.ndarray:
+        """Rotation vectors (N, 3) of the object in the script's axes, relative to the pick-up."""
+        tip, spin, roll = np.radians((self.tip_deg, self.spin_deg, self.roll_deg)) * self.size
+        first, second = self.order
+        about = np.zeros((len(times), 3))
+        about[:, 1] = tip * (0.5 * bump(times, 1.75, 2.3) - bump(times, 1.2, 1.85))
+        about[:, 2] = spin * first * (bump(times, 1.3, 1.8) - bump(times, 1.6, 2.2))
+        about[:, 0] = roll * second * bump(times, 1.45, 2.1)
+        return about
+
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to before the eyes, turned there about three axes, and back."""
         count = len(times)
         head = self.puppet.joint(world, pelvis, "head")
-        tip, spin, roll = np.radians((self.tip_deg, self.spin_deg, self.roll_deg)) * self.size
-        first, second = self.order
-        about = np.zeros((count, 3))
-        about[:, 1] = tip * (0.5 * bump(times, 1.75, 2.3) - bump(times, 1.2, 1.85))
-        about[:, 2] = spin * first * (bump(times, 1.3, 1.8) - bump(times, 1.6, 2.2))
-        about[:, 0] = roll * second * bump(times, 1.45, 2.1)
         offset = self.puppet.arm * np.array(self.before_eyes)
-        shown = self.before_chest(world, head, offset, about)
+        shown = self.before_chest(world, head, offset, self.turned(times))
         lift = np.array([0.0, 0, 0.04])
         prop = WristPose.still(self.pick_pose, count)
         prop = prop.towards(shown, ramp(times, self.attach_s, self.raised_s[0]), lift)
@@ -74,6 +83,34 @@ class Checking(HandlingScript):
             ramp(times, self.raised_s[1], self.release_s - 0.03),
             lift,
         )
+
+
+class Turning(Checking):
+    """Pick up an object, turn it slowly by large angles before the chest, put it back.
+
+    The object rests visibly before and after. Its underside is turned to the cameras.
+    """
+
+    highlight = 1.7
+    attach_s = 0.76  # grasp, script time
+    release_s = 2.76  # release, script time
+    raised_s = (1.06, 2.46)  # start and end of the turning before the chest, script time
+    lean_s = ((0.15, 0.7, 0.8, 1.15), (2.35, 2.7, 2.8, 3.2))
+    look_s = (0.9, 1.2, 2.3, 2.6)
+    # rotation vectors that the turning passes at even intervals, degrees about the axes ahead, to
+    # the left and up: positive = the left side up, the top away from the person, turned to the left
+    turns_deg: tuple[tuple[float, float, float], ...] = ()
+
+    def turned(self, times: np.ndarray) -> np.ndarray:
+        """A spline through ``turns_deg`` that starts and ends at rest."""
+        keys = np.radians([(0.0, 0.0, 0.0), *self.turns_deg, (0.0, 0.0, 0.0)])
+        start, end = self.attach_s + 0.12, self.release_s - 0.15
+        spline = CubicSpline(np.linspace(start, end, len(keys)), keys, bc_type="clamped")
+        return spline(np.clip(times, start, end)) * (0.9 + 0.1 * self.size)
+
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """Both elbows are away from the body while the object is before the chest."""
+        return 0.3 * plateau(times, 0.8, 1.1, 2.4, 2.7)
 
 
 class PassingOn(HandlingScript):
