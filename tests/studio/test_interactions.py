@@ -23,6 +23,7 @@ from tests.studio.studio_stage import make_stage
 
 FPS = 15
 CARRIED = ((0.0, 1.05), (2.5, 3.0))
+SCANNED = ((0.0, 0.74),)
 CHECKED, PASSED, SWUNG = (((0.0, 0.93), (end, 3.0)) for end in (2.53, 2.59, 2.57))
 
 
@@ -48,6 +49,7 @@ PALMS = {"right_hand", "left_hand"}
 DRUNK = {"right_hand", "mouth"}
 RACQUET = {"on_floor": False, "object_m_s": 10.0, "joint_m_s": 6.5, "joint_m_s2": 150.0}
 UMBRELLA = {"on_floor": False, "object_m_s": 6.5}
+TURNED = {"on_floor": False, "object_m_s": 3.5, "joint_m_s": 6.0, "joint_m_s2": 260.0}
 CASES = {
     "suitcase_carry": Case("s01", 11, {"right_hand"}, (17, 36), CARRIED),
     "cup_drink": Case("s02", 12, DRUNK, (17, 36), CARRIED, on_floor=False),
@@ -75,6 +77,10 @@ MORE_CASES = {
     "umbrella_turn": Case("s09", 26, {"right_hand"}, (16, 37), SWUNG, **UMBRELLA),
     "chair_sit": Case("s10", 193616834, {"seat", "back", "right_hand"}, (22, 33), ((0.0, 3.0),)),
     "toolbox_carry": Case("s02", 2, {"right_hand"}, (17, 36), CARRIED),
+    "bottle_scan": Case("s03", 9208, {"right_hand"}, (13, 40), SCANNED, **TURNED),
+    "chair_scan": Case("s09", 9207, PALMS, (13, 40), SCANNED, **TURNED),
+    "skateboard_scan": Case("s10", 9202, PALMS, (13, 40), SCANNED, **TURNED),
+    "racquet_scan": Case("s08", 9205, {"right_hand"}, (13, 40), SCANNED, **RACQUET),
 }
 
 

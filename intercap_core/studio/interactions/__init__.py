@@ -39,6 +39,12 @@ BETWEEN_PALMS = dict(
     before_eyes=(0.0, -0.70, 0.95),
     turns_deg=((65, 0, 0), (0, -30, 0), (-65, 0, 0), (0, 25, 0)),
 )
+CHAIR = dict(
+    before_eyes=(0.0, -0.75, 1.0), turns_deg=((65, 0, 0), (0, -30, 0), (-65, 0, 0), (0, 12, 0))
+)
+TIPPED = dict(
+    before_eyes=(0.0, -0.75, 0.90), turns_deg=((0, -60, 0), (12, 0, 0), (0, 65, 0), (-12, 0, 0))
+)
 # Each key has the wrist's place, the directions of fingers and thumb, and start and end.
 RACQUET = dict(  # a forehand: back, through the ball's place at the right, over the left shoulder
     handle_m=-0.27,
@@ -50,6 +56,21 @@ RACQUET = dict(  # a forehand: back, through the ball's place at the right, over
         Key((0.60, -0.25, -0.62), (0.50, -0.15, -0.85), (0.25, -0.95, 0.05), 1.42, 1.64),
         Key((0.62, 0.35, -0.10), (0.75, 0.60, 0.20), (0.10, -0.10, 1.00), 1.54, 1.74),
         Key((0.45, 0.75, 0.10), (0.30, 0.90, -0.20), (-0.60, 0.30, 0.75), 1.64, 1.92),
+    ),
+)
+SHOWN = dict(  # pointed up, to the right, to the left and up again, the other side ahead
+    attach_s=0.76,
+    release_s=2.78,
+    turn_back_rad=0.0,
+    turn_through_rad=0.0,
+    lean_s=((0.15, 0.7, 0.8, 1.15), (2.25, 2.7, 2.8, 3.2)),
+    right_steps_s=((0.86, 1.2), (2.1, 2.5)),
+    lower_s=(2.18, 2.66, 2.54),
+    keys=(
+        Key((0.62, -0.10, -0.40), (0.95, 0.25, 0.00), (0.00, 0.15, 1.00), 0.78, 1.20),
+        Key((0.62, -0.10, -0.40), (0.95, 0.10, 0.20), (0.10, -1.00, 0.15), 1.05, 1.50),
+        Key((0.62, -0.10, -0.40), (0.95, -0.15, -0.10), (0.20, 0.85, 0.40), 1.35, 1.95),
+        Key((0.62, 0.00, -0.45), (0.40, 0.90, 0.10), (0.30, -0.10, 1.00), 1.80, 2.25),
     ),
 )
 UMBRELLA = dict(  # as a cane: it points ahead, sweeps to the left and then low to the right
@@ -104,10 +125,22 @@ INTERACTIONS: dict[str, type[Interaction]] = {
     "cup_scan": _script(Turning, "cup", **IN_ONE_HAND),
     "suitcase_scan": _script(Turning, "suitcase", **BETWEEN_PALMS, top_of_height=0.25),
     "chair_scan": _script(  # its back is away from the person, the palms near its front edge
-        Turning, "chair", **BETWEEN_PALMS | dict(before_eyes=(0.0, -0.75, 1.0)),
+        Turning, "chair", **BETWEEN_PALMS | CHAIR,
         top_of_height=0.20, plinth_half_m=0.24, plinth_ahead_m=0.20, prop_heading_deg=-85.0,
         palms_m=(-0.15, 0.0, -0.01),
     ),
+    "stool_scan": _script(
+        Turning, "stool", **BETWEEN_PALMS, top_of_height=0.20, plinth_half_m=0.20,
+        plinth_ahead_m=0.26, palms_m=(-0.05, 0.0, 0.055),
+    ),
+    "toolbox_scan": _script(Turning, "toolbox", **BETWEEN_PALMS, top_of_height=0.42),
+    "football_scan": _script(Turning, "football", **BETWEEN_PALMS),
+    "skateboard_scan": _script(  # the palms are at its ends
+        Turning, "skateboard", **BETWEEN_PALMS | TIPPED, top_of_height=0.35,
+        plinth_half_m=0.28, plinth_ahead_m=0.22, palms_m=(0.0, 0.30, 0.02),
+    ),
+    "racquet_scan": _script(Swinging, "tennis_racquet", **RACQUET | SHOWN),
+    "umbrella_scan": _script(Swinging, "umbrella", **UMBRELLA | SHOWN),
     "walk_and_wave": WalkAndWave,
     "beam_walk": BeamWalk,
 }  # fmt: skip

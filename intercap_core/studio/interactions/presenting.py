@@ -94,9 +94,9 @@ class Turning(Checking):
     highlight = 1.7
     attach_s = 0.76  # grasp, script time
     release_s = 2.76  # release, script time
-    raised_s = (1.06, 2.46)  # start and end of the turning before the chest, script time
-    lean_s = ((0.15, 0.7, 0.8, 1.15), (2.35, 2.7, 2.8, 3.2))
-    look_s = (0.9, 1.2, 2.3, 2.6)
+    raised_s = (1.12, 2.28)  # start and end of the turning before the chest, script time
+    lean_s = ((0.15, 0.7, 0.82, 1.2), (2.15, 2.6, 2.8, 3.2))
+    look_s = (0.9, 1.2, 2.2, 2.5)
     # rotation vectors that the turning passes at even intervals, degrees about the axes ahead, to
     # the left and up: positive = the left side up, the top away from the person, turned to the left
     turns_deg: tuple[tuple[float, float, float], ...] = ()
@@ -104,13 +104,13 @@ class Turning(Checking):
     def turned(self, times: np.ndarray) -> np.ndarray:
         """A spline through ``turns_deg`` that starts and ends at rest."""
         keys = np.radians([(0.0, 0.0, 0.0), *self.turns_deg, (0.0, 0.0, 0.0)])
-        start, end = self.attach_s + 0.12, self.release_s - 0.15
+        start, end = self.attach_s + 0.12, self.release_s - 0.28
         spline = CubicSpline(np.linspace(start, end, len(keys)), keys, bc_type="clamped")
         return spline(np.clip(times, start, end)) * (0.9 + 0.1 * self.size)
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """Both elbows are away from the body while the object is before the chest."""
-        return 0.3 * plateau(times, 0.8, 1.1, 2.4, 2.7)
+        return 0.3 * plateau(times, 0.8, 1.1, 2.3, 2.65)
 
 
 class PassingOn(HandlingScript):

@@ -51,6 +51,11 @@ class Swinging(HandlingScript):
     back_s, through_s = (1.0, 1.35, 1.4, 1.7), (1.45, 1.75, 1.9, 2.3)
     attach_s = 0.96  # grasp, script time
     release_s = 2.56  # release, script time
+    # leaning to the block, to pick up and to lay down: times as :func:`plateau` takes them
+    lean_s = ((0.35, 0.9, 1.0, 1.4), (2.05, 2.5, 2.6, 3.0))
+    right_steps_s = ((1.04, 1.38), (1.98, 2.34))  # of the right foot, back and to the block again
+    # start and end of the way to above the block, and start of laying down, script time
+    lower_s = (2.0, 2.44, 2.32)
     block_share = 0.49  # height of the block's top, share of the person's height
     block_half_m = 0.23  # half the block's size across the person's way, metres
     overhang_m = 0.085  # from the middle of the hand to the block's edge, metres
@@ -67,8 +72,8 @@ class Swinging(HandlingScript):
         steps = [
             Step(RIGHT, 0.02, 0.40, (0.02, -w)),
             Step(1 - RIGHT, 0.34, 0.72, (0.04, w)),
-            Step(RIGHT, 1.04, 1.38, (-0.20, -w - 0.05), -0.5),
-            Step(RIGHT, 1.98, 2.34, (0.03, -w)),
+            Step(RIGHT, *self.right_steps_s[0], (-0.20, -w - 0.05), -0.5),
+            Step(RIGHT, *self.right_steps_s[1], (0.03, -w)),
         ]
         self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
         self.size = rng.uniform(0.9, 1.1, 3)
@@ -108,7 +113,7 @@ class Swinging(HandlingScript):
 
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the block, turn back and through with the swing, lean again."""
-        reach = plateau(times, 0.35, 0.9, 1.0, 1.4) + plateau(times, 2.05, 2.5, 2.6, 3.0)
+        reach = plateau(times, *self.lean_s[0]) + plateau(times, *self.lean_s[1])
         trunk = self.leaning(times, reach, 0.30 * reach)
         back, through = plateau(times, *self.back_s), plateau(times, *self.through_s)
         swing = self.turn_through_rad * through - self.turn_back_rad * back
@@ -139,8 +144,9 @@ class Swinging(HandlingScript):
         at_rest = self.place_pose @ self.object_from_wrist(RIGHT, times)
         last = WristPose.of(at_rest)
         above = WristPose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
-        wrist = wrist.towards(above, ramp(times, 2.0, 2.44))
-        wrist = wrist.towards(last, ramp(times, 2.32, self.release_s - 0.03))
+        start, over, lower = self.lower_s
+        wrist = wrist.towards(above, ramp(times, start, over))
+        wrist = wrist.towards(last, ramp(times, lower, self.release_s - 0.03))
         wrist_from_object = invert(self.object_from_wrist(RIGHT, times))
         offset = np.einsum("nij,nj->ni", wrist.rotation, wrist_from_object[:, :3, 3])
         return WristPose(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
