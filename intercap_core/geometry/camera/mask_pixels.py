@@ -128,11 +128,11 @@ def _mask_pixels(
         hidden_m: a pixel this far behind another one in a neighbouring cell is hidden.
     """
     mask = decode_box(ends, box, size[0])
-    across, down = int(size[1] / cell) + 1, int(size[0] / cell) + 1
+    cells_across, cells_down = int(size[1] / cell) + 1, int(size[0] / cell) + 1
     # cells around those that the mask touches
     left, top = max(int(box[0] / cell) - 2, 0), max(int(box[1] / cell) - 2, 0)
-    right = min(int((box[0] + box[2]) / cell) + 3, across)
-    bottom = min(int((box[1] + box[3]) / cell) + 3, down)
+    right = min(int((box[0] + box[2]) / cell) + 3, cells_across)
+    bottom = min(int((box[1] + box[3]) / cell) + 3, cells_down)
     nearest = np.full((bottom - top, right - left), np.float32(np.inf))
     height, width = rows[1] - rows[0], columns[1] - columns[0]
     u, v, z = (
@@ -158,8 +158,10 @@ def _mask_pixels(
             last -= 1
         z[r, :first], z[r, last:] = 0, 0
         row = rays[rows[0] + r, columns[0] + first : columns[0] + last]
+        # contiguous copies, without which the loop over pixels is not vectorised
+        across, down = row[:, 0].copy(), row[:, 1].copy()
         at = slice(first, last)
-        _project(near[at], counts[at], row, pose, lens, u[r, at], v[r, at], z[r, at])
+        _project(near[at], counts[at], across, down, pose, lens, u[r, at], v[r, at], z[r, at])
         for c in range(first, last):
             if z[r, c] > 0:
                 i = int(np.floor((v[r, c] + _HALF) / cell)) - top
@@ -236,10 +238,11 @@ def decode_box(ends, box, height):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # divisions that fail are no exceptions
-def _project(near, counts, rays, pose, lens, u, v, z):
+def _project(near, counts, across, down, pose, lens, u, v, z):
     """Write colour pixels and depth (W,) of a row of depth pixels to ``u``, ``v`` and ``z``.
 
-    The depth is 0 if the pixel does not count or its point is outside the lens model.
+    ``across`` and ``down`` (W,) are the X/Z and Y/Z of their rays. The depth is 0 if the pixel does
+    not count or its point is outside the lens model.
     """
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = lens
     distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
@@ -249,7 +252,7 @@ def _project(near, counts, rays, pose, lens, u, v, z):
     one, millimetre, least = np.float32(1), np.float32(1e-3), np.float32(MIN_DEPTH_M)
     for at in range(len(near)):
         pz = np.float32(near[at]) * millimetre
-        px, py = rays[at, 0] * pz, rays[at, 1] * pz
+        px, py = across[at] * pz, down[at] * pz
         x, y = a * px + b * py + c * pz + d, e * px + f * py + g * pz + h
         depth = i * px + j * py + k * pz + m
         reach = limit * depth
