@@ -154,9 +154,6 @@ class ObjectClip:
         return self.true_views >= SEEN_VIEWS
 
 
-_BY_FRAME = (
-    "keypoints", "confidence", "joints", "joint_views", "mask_source", "image_of", "times",
-)  # fmt: skip
 _CHUNK = 32  # bodies posed at once
 
 
@@ -192,7 +189,7 @@ class BodyClip:
                 f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
                 "recording with the body model that it was made for"
             )
-        clouds = list(person_clouds(frames, seen, settings.points_per_frame))
+        clouds = list(person_clouds(frames, person, seen, settings.points_per_frame))
         return cls(model, seen, clouds, settings, truth.vertices)
 
     def __len__(self) -> int:
@@ -200,21 +197,11 @@ class BodyClip:
 
     def part(self, frames: slice) -> BodyClip:
         """A clip of some of the frames."""
-        numbers, cameras = range(len(self))[frames], len(self.seen.rig)
-        seen = replace(
-            self.seen,
-            **{
-                name: [
-                    getattr(self.seen, name)[t * cameras + c]
-                    for t in numbers
-                    for c in range(cameras)
-                ]
-                for name in ("masks", "other_masks")
-            },
-            **{name: getattr(self.seen, name)[frames] for name in _BY_FRAME},
-        )
         return replace(
-            self, seen=seen, clouds=self.clouds[frames], true_vertices=self.true_vertices[frames]
+            self,
+            seen=self.seen.window(frames),
+            clouds=self.clouds[frames],
+            true_vertices=self.true_vertices[frames],
         )
 
     def errors(self, vectors: Tensor, frames: np.ndarray, *, step: int = 1) -> np.ndarray:
@@ -292,7 +279,9 @@ class JointClip:
             floor = FloorPlane(scene["ground_point"], scene["ground_normal"]) if found else None
             fps = float(scene.attributes["fps"])
         seen = read_observations(paths["scene"], paths["person"])
-        clouds = list(person_clouds(paths["frames"], seen, settings.points_per_frame))
+        clouds = list(
+            person_clouds(paths["frames"], paths["person"], seen, settings.points_per_frame)
+        )
         fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model))
         start = sequential.state
         if failed.any() or len(fitter.frames) != len(start):

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.thread_pool import ThreadPool, threads_of_job
-from intercap_core.schemas import BODY_FIT
+from intercap_core.schemas import BODY_FIT, PERSON
 
 EDGE_TRUST = 0.3  # trust of a point at a depth edge; tuned on the studio
 
@@ -102,37 +102,60 @@ def _cloud_of_arrays(
     return PersonCloud(of(points), of(normals), of(trust), of(view), windows, outlines)
 
 
+class _Masks(NamedTuple):
+    """Masks in one image."""
+
+    person: bytes
+    """RLE of the person's mask; empty = none."""
+    source: int
+    """What segmented the person; see :mod:`intercap_core.formats.detections.read`."""
+    others: bytes
+    """RLE of other detected objects; empty = none."""
+
+
 def person_clouds(
-    frames: Path, observations: Observations, count: int
+    frames: Path, person: Path, observations: Observations, count: int
 ) -> Iterator[PersonCloud | None]:
     """Yield the cloud of each frame, of about ``count`` points; None = no usable mask."""
     threads = ThreadPool(threads_of_job())
     together = 16  # frames, limited by memory: a cloud and its depth images have 0.8 MB
-    with Frames.open(frames) as reader:
+    with Frames.open(frames) as reader, artefacts.read(person, PERSON) as read:
         reader = reader.showing(observations.image_of)
         for start in range(0, observations.num_frames, together):
+            some = range(observations.num_frames)[start : start + together]
             yield from threads.map(
-                lambda t: _fuse(reader, observations, t, count),
-                range(observations.num_frames)[start : start + together],
+                lambda of_frame: _fuse(reader, observations, *of_frame, count),
+                list(zip(some, _read_masks(read, some, len(observations.rig)), strict=True)),
             )
 
 
-def _fuse(reader: Frames, observations: Observations, t: int, count: int) -> PersonCloud | None:
+def _read_masks(read: Artefact, frames: range, cameras: int) -> list[list[_Masks]]:
+    """Return the masks of some frames, by frame and camera."""
+    images = slice(frames.start * cameras, frames.stop * cameras)
+    persons = [rle.tobytes() for (rle,) in _ragged(read, "mask", ("rle",), images)]
+    others = [b""] * len(persons)
+    if "beside_offsets" in read:
+        others = [rle.tobytes() for (rle,) in _ragged(read, "beside", ("rle",), images)]
+    source = read.rows("mask_source", slice(frames.start, frames.stop)).ravel().tolist()
+    masks = list(map(_Masks, persons, source, others))
+    return [masks[first : first + cameras] for first in range(0, len(masks), cameras)]
+
+
+def _fuse(
+    reader: Frames, observations: Observations, t: int, masks: Sequence[_Masks], count: int
+) -> PersonCloud | None:
     """Return the depth points of frame t within the person's masks, and the rims of the masks."""
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
     windows, outlines = [], []
-    for c, camera in enumerate(observations.rig):
-        at = t * len(observations.rig) + c
-        mask = _runs(observations.masks[at], camera)
+    for c, (camera, of_image) in enumerate(zip(observations.rig, masks, strict=True)):
+        mask = _runs(of_image.person, camera)
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
         # The rim of a detector's mask is used. That of a foreground segmentation is used only if
         # there is no depth, and if masks of other objects tell where they cover the person.
-        if observations.mask_source[t, c] == FROM_DETECTOR or (
-            depth is None and observations.other_masks[at]
-        ):
-            rim = trace_outline(mask, _runs(observations.other_masks[at], camera), camera.colour, c)
+        if of_image.source == FROM_DETECTOR or (depth is None and of_image.others):
+            rim = trace_outline(mask, _runs(of_image.others, camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue

@@ -1,4 +1,4 @@
-"""Observations of the person in all frames: keypoints, masks and cameras."""
+"""Observations of the person in all frames: keypoints and cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.artefacts import unpack_ragged
 from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
@@ -28,19 +27,13 @@ class Observations:
     sequence: str
     rig: Rig
     keypoints: np.ndarray
-    """(T, C, K, 2) px."""
+    """(T, C, K, 2) float32, px."""
     confidence: np.ndarray
-    """(T, C, K), 0 = not detected."""
+    """(T, C, K) float32, 0 = not detected."""
     joints: np.ndarray
-    """(T, K, 3) triangulated keypoints, master frame, metres, NaN = unknown."""
+    """(T, K, 3) float32 triangulated keypoints, master frame, metres, NaN = unknown."""
     joint_views: np.ndarray
     """(T, K) number of views of each triangulated keypoint."""
-    masks: list[bytes]
-    """RLE of the person's mask in each of T * C images (index t C + c), empty = none."""
-    mask_source: np.ndarray
-    """(T, C) source of each mask: 0 none, 1 detector, 2 foreground segmentation."""
-    other_masks: list[bytes]
-    """RLE of other detected objects in each of T * C images, empty = none."""
     background: list[np.ndarray | None]
     """Depth image of the empty room in each camera, mm; None = unknown."""
     depth_bias: np.ndarray
@@ -87,15 +80,8 @@ class Observations:
 
     def window(self, frames: slice) -> Observations:
         """Return the observations of some frames."""
-        cameras = len(self.rig)
-        images = slice(frames.start * cameras, frames.stop * cameras)
-        by_frame = ("keypoints", "confidence", "joints", "joint_views", "mask_source")
-        return replace(
-            self,
-            masks=self.masks[images],
-            other_masks=self.other_masks[images],
-            **{name: getattr(self, name)[frames] for name in (*by_frame, "image_of", "times")},
-        )
+        by_frame = ("keypoints", "confidence", "joints", "joint_views", "image_of", "times")
+        return replace(self, **{name: getattr(self, name)[frames] for name in by_frame})
 
 
 def read_observations(scene: Path, person: Path) -> Observations:
@@ -119,18 +105,13 @@ def read_observations(scene: Path, person: Path) -> Observations:
                 f"expected {len(times)} of {', '.join(rig.names)} as in {scene}; re-run stage "
                 "'person' for this sequence"
             )
-        keypoints = read["keypoints"].astype(np.float64)
-        joints, views = read["joints"].astype(np.float64), read["joint_views"]
+        keypoints, joints, views = read["keypoints"], read["joints"], read["joint_views"]
         inlier = read["inlier"]
-        masks, source = unpack_ragged(read["mask_offsets"], read["mask_rle"]), read["mask_source"]
-        others = [b""] * len(masks)
-        if "beside_offsets" in read:
-            others = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     # keypoints of a view that disagree with the triangulated point lose most of their confidence;
     # the factor is tuned on the studio
     outlier = (views >= 2)[:, None] & ~inlier
-    confidence = np.where(outlier, 0.2 * confidence, confidence)
+    confidence[outlier] = 0.2 * confidence[outlier].astype(np.float64)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
         sequence=sequence,
@@ -139,9 +120,6 @@ def read_observations(scene: Path, person: Path) -> Observations:
         confidence=confidence,
         joints=joints,
         joint_views=views,
-        masks=masks,
-        mask_source=source,
-        other_masks=others,
         background=background,
         depth_bias=depth_bias,
         image_of=image_of,

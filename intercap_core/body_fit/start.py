@@ -32,7 +32,7 @@ def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.
         (T, 6) rotation vectors and translations, NaN if fewer than three trunk keypoints are known.
     """
     result = np.full((len(joints), 6), np.nan)
-    for t, frame in enumerate(joints[:, TRUNK_KEYPOINTS]):
+    for t, frame in enumerate(joints[:, TRUNK_KEYPOINTS].astype(float)):
         known = np.isfinite(frame).all(1)
         if known.sum() < 3:
             continue

@@ -88,6 +88,7 @@ def fit(
             estimate_contact, own, settings, annotated and annotated.window(window.used)
         )
         fits.append(_fit_window(own, assembly, state.window(window.used), contact_at))
+        del own, assembly, contact_at  # before the next window is opened
     corrected = cameras is not None and not cameras.refused
     return _joined(inputs, windows, fits, annotated, cameras_corrected=corrected)
 
@@ -111,6 +112,7 @@ def _correct_cameras(
             assembly.take_cameras(cameras.now)
             for form in assembly.camera_evidence(state.window(at)):
                 yield replace(form, frames=form.frames + at.start)
+            del assembly, form  # before the next window is opened
 
     correction = cameras.solve(evidence(), len(state))
     if cameras.take(correction):

@@ -6,7 +6,6 @@ shape, the thickness of the clothing and the offsets of the detector's keypoints
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,9 +69,8 @@ def run(
             "keypoints and the camera poses of this sequence"
         )
     clouds: DiskList[PersonCloud | None] = DiskList(output.parent)
-    for cloud in person_clouds(frames, seen, settings.points_per_frame):
+    for cloud in person_clouds(frames, person, seen, settings.points_per_frame):
         clouds.append(cloud)
-    seen = replace(seen, masks=[], other_masks=[])  # of no use any more
     definition = Definition.read(settings.keypoint_definition)
     fit = Fitter(model, seen, clouds, settings, pose_prior, definition=definition).run()
 

@@ -31,7 +31,7 @@ def test_clouds_of_some_frames_are_read_as_they_were_written(tmp_path_factory) -
         capture.paths["frames"],
         read_observations(capture.paths["scene"], capture.paths["person"]),
     )
-    clouds = list(person_clouds(frames, seen, 500))
+    clouds = list(person_clouds(frames, capture.paths["person"], seen, 500))
     assert clouds[2].windows and clouds[2].outlines
     clouds[3] = None
     path = Path(tmp_path_factory.mktemp("clouds")) / "body_fit.h5"

@@ -58,8 +58,8 @@ def test_frames_near_placed_frames_are_usable_with_six_keypoints() -> None:
     times[11] += 2.0  # no placed frame nearby
     observations = Observations(
         "test", rig, np.zeros((frames, 2, 135, 2)), np.zeros((frames, 2, 135)), joints,
-        np.ones((frames, 135), int), [b""] * 2 * frames, np.zeros((frames, 2)), [b""] * 2 * frames,
-        [None, None], np.zeros(2), np.zeros((frames, 2), int), np.zeros(2), times,
+        np.ones((frames, 135), int), [None, None], np.zeros(2), np.zeros((frames, 2), int),
+        np.zeros(2), times,
     )  # fmt: skip
     assert np.flatnonzero(~observations.placed).tolist() == [4, 5, 11]
     assert np.flatnonzero(~observations.usable).tolist() == [5, 11]

@@ -406,7 +406,8 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
             "keypoint_sigma": np.full(135, 0.01), "covering_noise": np.full(len(COVERINGS), 0.01),
         })  # fmt: skip
         seen = read_observations(capture.paths["scene"], capture.paths["person"])
-        put_clouds(writer, person_clouds(capture.paths["frames"], seen, 3000), count)
+        clouds = person_clouds(capture.paths["frames"], capture.paths["person"], seen, 3000)
+        put_clouds(writer, clouds, count)
         fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
         capture.paths["joint"], JOINT, object=object_name, iterations=3, refused=0,

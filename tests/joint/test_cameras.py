@@ -64,7 +64,7 @@ def _make_fitter(folder: Path, frames: int) -> Fitter:
         model.keypoints(body).double().numpy(),
     )
     observed = read_observations(inputs.scene, inputs.person)
-    clouds = list(person_clouds(inputs.frames, observed, 3000))
+    clouds = list(person_clouds(inputs.frames, inputs.person, observed, 3000))
     return Fitter(model, observed, clouds, BodyFitSettings(points_per_frame=3000))
 
 

@@ -347,7 +347,7 @@ def test_a_body_with_strong_blend_shapes_is_fitted(tmp_path):
     model = BodyModel(replace(file, posedirs=moves), torch.device("cpu"), torch.float32)
     capture = Capture(model, tmp_path, 2, cameras=4, pixel_noise=1.0, depth_noise_mm=3.0)
     seen = read_observations(capture.inputs.scene, capture.inputs.person)
-    clouds = list(person_clouds(capture.inputs.frames, seen, 800))
+    clouds = list(person_clouds(capture.inputs.frames, capture.inputs.person, seen, 800))
     vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
     found = model.forward(model.parameters(vectors)).joints.numpy()
     assert 1000 * np.linalg.norm(found - capture.joints, axis=2)[:, :22].mean() < 6

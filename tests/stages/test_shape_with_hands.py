@@ -57,7 +57,6 @@ def _seen(model: BodyModel, truth: torch.Tensor) -> Observations:
     views = np.full(points.shape[:2], len(rig))
     return Observations(
         "test", rig, pixels, np.full(pixels.shape[:3], 0.9), points, views,
-        [b""] * (FRAMES * len(rig)), np.zeros((FRAMES, len(rig))), [b""] * (FRAMES * len(rig)),
         [None] * len(rig), np.zeros(len(rig)),
         np.repeat(np.arange(FRAMES)[:, None], len(rig), 1), np.zeros(len(rig)),
         np.arange(FRAMES) / FPS,
