@@ -382,6 +382,13 @@ class Artefact:
             )
         return values
 
+    def blocks(self, key: str, size: int = 64) -> Iterator[np.ndarray]:
+        """Read a dataset ``size`` rows at a time, which bounds the memory."""
+        start = 0
+        while len(part := self.rows(key, slice(start, start + size))):
+            yield part
+            start += size
+
     def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
         """Shape, type, units and frame of a dataset."""
         try:

@@ -130,8 +130,11 @@ def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
                     is_text = METRICS.fields[key].dtype == "str"
                     writer.put(key, metrics.text(key) if is_text else metrics[key])
             if "body_contact_distance" in metrics:
-                touching = vertex_contact(metrics["body_contact_distance"], CONTACT_M)
-                writer.put("body_contact_frames", touching.sum(0).astype(np.int32))
+                counts = [
+                    vertex_contact(distance, CONTACT_M).sum(0)
+                    for distance in metrics.blocks("body_contact_distance")
+                ]
+                writer.put("body_contact_frames", np.sum(counts, axis=0, dtype=np.int32))
             with artefacts.read(paths.scene, SCENE) as scene:
                 for key, values in _rig(scene).items():
                     writer.put(f"rig/{key}", values)

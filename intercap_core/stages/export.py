@@ -83,7 +83,7 @@ def run(
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
     about = _about(paths, motion, mesh)
     posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
-    bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
+    bodies = body_vertices(motion, output.parent) if posed else ()
     exported = images.undistorted(rig) if settings.undistort else rig
     scenes = Scenes(motion, exported, mesh, image_of, times, time_offset, bodies)
     output.mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -91,15 +92,15 @@ class VertexRuns:
     inside."""
 
     @classmethod
-    def of(cls, distance: np.ndarray) -> VertexRuns:
-        """Select vertices in contact by contact distances (T, V), metres."""
-        touching = vertex_contact(distance)
-        offsets = np.concatenate([[0], np.cumsum(touching.sum(1))])
-        return cls(
-            offsets.astype(np.int64),
-            np.nonzero(touching)[1].astype(np.int32),
-            distance[touching].astype(np.float32),
-        )
+    def of(cls, blocks: Iterable[np.ndarray]) -> VertexRuns:
+        """Select vertices in contact by contact distances (T, V), metres, in blocks of frames."""
+        parts = []
+        for distance in blocks:
+            touching = vertex_contact(distance)
+            vertices = np.nonzero(touching)[1].astype(np.int32)
+            parts.append((touching.sum(1), vertices, distance[touching].astype(np.float32)))
+        counts, vertices, near = map(np.concatenate, zip(*parts, strict=True))
+        return cls(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), vertices, near)
 
     def at(self, t: int) -> np.ndarray:
         """Return the indices of the vertices that touch in frame ``t``."""
@@ -141,15 +142,15 @@ class ContactVertices:
                         f"{metrics}: has no {key}, although sequence {motion.sequence!r} has an "
                         "object; re-run stage 'metrics'"
                     )
-                distance = artefact[key]
-                if distance.shape != (len(motion), count):
+                (frames, vertices), *_ = artefact.describe(key)
+                if (frames, vertices) != (len(motion), count):
                     raise UserError(
-                        f"{metrics}: {key} has {distance.shape[0]} frames of {distance.shape[1]} "
+                        f"{metrics}: {key} has {frames} frames of {vertices} "
                         f"vertices, but sequence {motion.sequence!r} has {len(motion)} frames and "
                         f"{surface} has {count} vertices: it was measured on another result; "
                         "re-run stage 'metrics'"
                     )
-                surfaces.append(VertexRuns.of(distance))
+                surfaces.append(VertexRuns.of(artefact.blocks(key)))
         return cls(*surfaces)
 
     def to_arrays(self) -> dict[str, np.ndarray]:

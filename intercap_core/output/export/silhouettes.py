@@ -6,13 +6,15 @@ pinhole for undistorted images.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from intercap_core.disk import DiskList
 from intercap_core.geometry.camera.masks import encode_window
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply_step, rigid
@@ -96,8 +98,8 @@ class Scenes:
     """(T,) seconds."""
     time_offset: np.ndarray
     """(C,) seconds by which each camera exposes later."""
-    bodies: np.ndarray
-    """(T, V, 3) vertices of the body, master frame; empty if no format needs them."""
+    bodies: Sequence[np.ndarray]
+    """Vertices (V, 3) of the body in each frame, master frame; empty if no format needs them."""
 
     @cached_property
     def poses(self) -> list[dict[int, np.ndarray]]:
@@ -160,10 +162,16 @@ class Scenes:
             yield Silhouettes(image, t, pose, _visible_part(both, 0), object_, whole, both.depth)
 
 
-def body_vertices(motion: Motion) -> np.ndarray:
-    """Compute the body's vertices (T, V, 3) float32 in the motion's frame."""
-    batches = posed_batches(motion.model, motion.parameters)
-    return np.concatenate([posed.vertices.numpy() for posed in batches])
+def body_vertices(motion: Motion, folder: Path) -> DiskList[np.ndarray]:
+    """Compute the body's vertices (V, 3) float32 of each frame in the motion's frame.
+
+    They are kept in a temporary file in ``folder``: 18,000 frames have 2.3 GB.
+    """
+    bodies: DiskList[np.ndarray] = DiskList(folder)
+    for posed in posed_batches(motion.model, motion.parameters):
+        for vertices in posed.vertices.numpy():
+            bodies.append(vertices)
+    return bodies
 
 
 def _visible_part(rendering: Rendering, number: int) -> Mask:

@@ -164,14 +164,18 @@ def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Flags:
     """Add touching vertices as bits (T, ceil(V / 8)); return the flags."""
     with artefacts.read(metrics, METRICS) as measured:
         if "body_contact_distance" in measured:
-            touching = vertex_contact(measured["body_contact_distance"])
-            if touching.shape[1] != num_vertices:
+            (_, measured_vertices), *_ = measured.describe("body_contact_distance")
+            if measured_vertices != num_vertices:
                 raise UserError(
                     f"{metrics}: sequence {measured.attributes['sequence']!r} was measured on a "
-                    f"body of {touching.shape[1]} vertices, but its fitted body has "
+                    f"body of {measured_vertices} vertices, but its fitted body has "
                     f"{num_vertices}; re-run stage 'metrics'"
                 )
-            content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
+            bits = [
+                np.packbits(vertex_contact(distance), axis=1, bitorder="little")
+                for distance in measured.blocks("body_contact_distance")
+            ]
+            content.arrays["contact/touching"] = np.concatenate(bits)
         return Flags.read(measured)
 
 

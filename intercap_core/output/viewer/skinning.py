@@ -4,13 +4,16 @@ Vertices are skinned by their four largest weights. The residual (smaller weight
 changes of shape or expression) is transformed to the rest pose and approximated by a truncated
 singular value decomposition: modes over all vertices with an amount per frame. Modes are added,
 largest singular value first, until every vertex is within ``CLOSE_M``, at most ``_MOST_MODES``.
+Long recordings have the modes of ``_MODE_FRAMES`` frames; other frames are projected onto them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import PARENTS
@@ -20,6 +23,9 @@ from intercap_core.output.export.motion import posed_batches, rest_pose
 
 CLOSE_M = 0.001  # largest distance of a vertex from the model's
 _MOST_MODES = 64
+# Largest number of frames that determine the modes. Two copies of a residual take 650 kB, and time
+# grows with the cube of their number.
+_MODE_FRAMES = 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,23 +60,41 @@ def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     strongest = np.argsort(-all_weights, axis=1, kind="stable")[:, :4]
     weights = np.take_along_axis(all_weights, strongest, 1)
     weights /= weights.sum(1, keepdims=True)
-    batches = list(posed_batches(model, parameters))
-    vertices = np.concatenate([posed.vertices.double().numpy() for posed in batches])
-    joints = np.concatenate([posed.joints.double().numpy() for posed in batches])
-    turns = _global_rotations(parameters.full_pose().numpy())
-    shifts = joints - np.einsum("tjab,jb->tja", turns, rest_joints)
-    transforms = np.concatenate([turns, shifts[..., None]], 3)
-    residual = np.stack(
-        [
-            _unskinned(vertices[t], transforms[t], strongest, weights) - rest
-            for t in range(len(vertices))
-        ]
-    )
+    count = parameters.batch
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MODE_FRAMES)).round().astype(int))
+    transforms = np.empty((count, len(rest_joints), 3, 4))
+
+    def residuals(frames: np.ndarray) -> Iterator[np.ndarray]:
+        """Set the transforms of ``frames``; yield residuals (b, V, 3) in the rest pose."""
+        some = parameters.frames(torch.from_numpy(frames))
+        turns, first = _global_rotations(some.full_pose().numpy()), 0
+        for posed in posed_batches(model, some):
+            at = slice(first, first := first + len(posed.joints))
+            shifts = posed.joints.double().numpy()
+            shifts -= np.einsum("tjab,jb->tja", turns[at], rest_joints)
+            own = transforms[frames[at]] = np.concatenate([turns[at], shifts[..., None]], 3)
+            vertices = posed.vertices.double().numpy()
+            yield np.stack(
+                [
+                    _unskinned(points, of_frame, strongest, weights) - rest
+                    for points, of_frame in zip(vertices, own, strict=True)
+                ]
+            )
+
+    residual = np.concatenate(list(residuals(chosen)))
     # A constant residual belongs to the rest pose and needs no mode.
-    rest = rest + residual.mean(0)
-    residual -= residual.mean(0)
-    modes, amounts, error = _modes(residual)
-    return SkinnedBody(rest, strongest, weights, transforms, modes, amounts, error)
+    constant = residual.mean(0)
+    residual -= constant
+    modes, of_chosen, error = _modes(residual)
+    amounts = np.empty((count, len(modes)))
+    amounts[chosen] = of_chosen
+    del residual
+    others, first = np.setdiff1d(np.arange(count), chosen), 0
+    for residual in residuals(others):
+        at = others[first : first + len(residual)]
+        amounts[at], largest = _project(residual - constant, modes)
+        error, first = max(error, largest), first + len(residual)
+    return SkinnedBody(rest + constant, strongest, weights, transforms, modes, amounts, error)
 
 
 def _global_rotations(pose: np.ndarray) -> np.ndarray:
@@ -136,6 +160,18 @@ def _modes(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         np.array(amounts).reshape(len(modes), frames).T,
         float(_largest_norm(remaining)),
     )
+
+
+def _project(residual: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Project residuals (b, V, 3) onto modes (K, V, 3), one after the other.
+
+    Returns amounts (b, K) and the largest remaining distance, metres.
+    """
+    remaining, amounts = residual.reshape(len(residual), -1), np.empty((len(residual), len(modes)))
+    for k, mode in enumerate(modes.reshape(len(modes), -1)):
+        amounts[:, k] = remaining @ mode / (mode @ mode)
+        remaining = remaining - np.outer(amounts[:, k], mode)
+    return amounts, _largest_norm(remaining)
 
 
 def _largest_norm(rows: np.ndarray) -> float:
