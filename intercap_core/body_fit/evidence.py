@@ -118,8 +118,7 @@ class Evidence:
         keypoints, follow from the whole sequence.
         """
         self.model, self.cloud_weight = model, cloud_weight
-        usable = observations.usable
-        median_confidence = _median_confidence(observations.confidence[usable])
+        usable, median_confidence = observations.usable, observations.median_confidence
         if window is not None:
             observations, usable = observations.window(window), usable[window]
         self.observations = observations
@@ -189,6 +188,7 @@ class Evidence:
         """
         observations, frames = self.observations, self.frames
         problem.keypoints = self.keypoints(hands=hands, face=face)
+        problem.views = None  # those of the last update are not used
         chosen = problem.keypoints.index
         at = np.ix_(frames, np.arange(len(observations.rig)), chosen.numpy())
         points = self.points(problem)
@@ -223,19 +223,25 @@ class Evidence:
 
     def points(self, problem: BodyProblem) -> Tensor:
         """Return the current positions (N, K, 3) of the problem's keypoints, with offsets."""
-        return keypoint_term.evaluate(
-            self.model,
-            self.model.parameters(problem.base),
-            problem.keypoints,
-            problem.all_offsets(),
-            derivatives=False,
-        ).points
+        params, offsets = self.model.parameters(problem.base), problem.all_offsets()
+        parts = (
+            keypoint_term.evaluate(
+                self.model, params.frames(at), problem.keypoints, offsets, derivatives=False
+            ).points
+            for at in _blocks(len(self.frames))
+        )
+        return torch.cat([problem.base.new_zeros(0, len(problem.keypoints.index), 3), *parts])
 
     def pixel_residuals(self, problem: BodyProblem) -> Tensor:
         """Return projections minus observations (N, C, K, 2), px, of the problem's keypoints."""
         if problem.views is None:
             raise ValueError("the problem has no views to compare with")
-        return keypoint_term.pixel_residuals(self.points(problem), problem.views)
+        points, views = self.points(problem), problem.views
+        parts = (
+            keypoint_term.pixel_residuals(points[at], views.frames(at))
+            for at in _blocks(len(points))
+        )
+        return torch.cat([views.observed[:0], *parts])
 
     def _shift(self, points: Tensor, frames: slice = slice(None)) -> Tensor | None:
         """Return the displacement (N, C, K, 3) of points (N, K, 3) until each camera exposes.
@@ -274,9 +280,9 @@ class Evidence:
         assert views is not None
         index = problem.keypoints.index
         # residuals in metres, at median confidence and without the factor ``widened``
-        scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
-        scaled = scaled * self.keypoint_sigma[index, None]
-        scaled = scaled * self._sigma_factor(views.confidence, index)[..., None]
+        scaled = self.pixel_residuals(problem).abs_().div_(views.sigma[..., None])
+        scaled *= self.keypoint_sigma[index, None]
+        scaled *= self._sigma_factor(views.confidence, index)[..., None]
         for part, start in KEYPOINT_SIGMA_M:
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
@@ -436,19 +442,6 @@ class Evidence:
         weight = share * total / (total + 2.0) / noise**2
         target = mean + (by_view.normal * by_view.where).sum(2)
         return CloudRows(target, by_view.normal, weight)
-
-
-def _median_confidence(confidence: np.ndarray) -> np.ndarray:
-    """Return the median (K,) of confidences (N, C, K) above 0, one for each part of the body.
-
-    1 for a part that is never detected.
-    """
-    median = np.ones(NUM_KEYPOINTS)
-    for part, _ in KEYPOINT_SIGMA_M:
-        detected = confidence[..., part][confidence[..., part] > 0]
-        if len(detected):
-            median[part] = np.median(detected)
-    return median
 
 
 def _joined(parts: list[ViewDistances]) -> ViewDistances:

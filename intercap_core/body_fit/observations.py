@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX
+from intercap_core.body.keypoints import (
+    BODY,
+    CONTOUR,
+    FACE,
+    KEYPOINT_INDEX,
+    LEFT_HAND,
+    NUM_KEYPOINTS,
+    RIGHT_HAND,
+)
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.schemas import PERSON, SCENE
@@ -56,7 +65,7 @@ class Observations:
         trunk = self.joints[:, TRUNK_KEYPOINTS]
         return np.isfinite(trunk).all(2).sum(1) >= 3
 
-    @property
+    @cached_property
     def usable(self) -> np.ndarray:
         """(T,) bool: frames that are fitted.
 
@@ -73,10 +82,24 @@ class Observations:
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
         return placed | ((gap <= 1.0) & (known >= 6))
 
+    @cached_property
+    def median_confidence(self) -> np.ndarray:
+        """(K,) median confidence of detected keypoints in usable frames, by part of the body.
+
+        1 for a part that is never detected.
+        """
+        median = np.ones(NUM_KEYPOINTS)
+        for part in (BODY, LEFT_HAND, RIGHT_HAND, slice(FACE.start, CONTOUR.stop)):
+            confidence = self.confidence[self.usable, :, part]
+            detected = confidence[confidence > 0]
+            if len(detected):
+                median[part] = np.median(detected)
+        return median
+
     @property
     def cameras_of_person(self) -> np.ndarray:
         """(C,) bool: the camera shows a keypoint of the body in a usable frame."""
-        return (self.confidence[self.usable][:, :, BODY] > 0).any((0, 2))
+        return np.asarray((self.confidence[self.usable, :, BODY] > 0).any((0, 2)))
 
     def window(self, frames: slice) -> Observations:
         """Return the observations of some frames."""

@@ -37,7 +37,7 @@ class Views:
     shift: Tensor | None = None
     """(T, C, K, 3) displacement of the keypoints until the camera exposes, metres."""
 
-    def frames(self, index: Tensor) -> Views:
+    def frames(self, index: Tensor | slice) -> Views:
         """Return the detections of the frames ``index`` (b,)."""
         return Views(
             self.observed[index],
