@@ -159,7 +159,7 @@ STAGES: dict[str, Stage] = {
             purpose="Body and object together, over all frames, with contact.",
             reads=_FITS,
             resources=JobResources(
-                690, mb_per_image=0.05, window=460, mb_per_window_image=0.5,
+                690, mb_per_image=0.015, window=460, mb_per_window_image=0.5,
                 seconds=20, seconds_per_image=0.06,
             ),
             output_bytes=700_000,

@@ -44,17 +44,3 @@ def test_windows_join_to_the_fit_of_the_recording(
             np.testing.assert_allclose(joined[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
         else:
             np.testing.assert_array_equal(joined[name], values, err_msg=name)
-
-
-def test_a_seam_does_not_show_in_the_joined_fit(tmp_path, tmp_path_factory, monkeypatch):
-    frames, overlap = 48, 10
-    ball = HeldBall.copied(shared_capture(tmp_path_factory, frames), tmp_path)
-    whole = ball.run()
-    halves = partial(split_frames, size=frames // 2, overlap=overlap)
-    monkeypatch.setattr(fit, "split_frames", halves)
-    joined = ball.run()
-    far = np.abs(np.arange(frames) + 0.5 - frames / 2) > overlap
-    for name in ("joints", "translation"):
-        moved = np.linalg.norm(joined[name] - whole[name], axis=-1).reshape(frames, -1).max(1)
-        assert moved[far].max() < 1e-4  # 0.1 mm
-        assert moved.max() < 5e-4
