@@ -30,6 +30,7 @@ from intercap_core.joint.result import Convergence, JointFit
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyResiduals
 from intercap_core.joint.windows import Window, join, split_frames
+from intercap_core.memory import return_freed_memory
 
 # Corrections of the cameras before the first round: with three the object's error is less than 0.01
 # mm smaller, with one up to 0.11 mm larger (bench/RESULTS.md).
@@ -89,6 +90,7 @@ def fit(
         )
         fits.append(_fit_window(own, assembly, state.window(window.used), contact_at))
         del own, assembly, contact_at  # before the next window is opened
+        return_freed_memory()
     corrected = cameras is not None and not cameras.refused
     return _joined(inputs, windows, fits, annotated, cameras_corrected=corrected)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import logging
 import os
@@ -15,6 +14,7 @@ from typing import Any
 from intercap_core import artefacts, schemas
 from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
+from intercap_core.memory import return_large_arrays
 from intercap_core.pipeline import outcome, stage_inputs
 from intercap_core.pipeline.checksums import (
     INPUTS_FILE,
@@ -32,9 +32,6 @@ from intercap_core.sequence_inputs import SequencePaths
 from intercap_core.stage_list import STAGES
 
 log = logging.getLogger(__name__)
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-_RETURNED_BYTES = 4 << 20  # size from which on freed memory goes back to the system
 
 
 def run_step(
@@ -64,7 +61,7 @@ def run_step(
         {name: (inputs or {}).get(name, project.artefact(sequence, name)) for name in reads},
         output or project.artefact(sequence, stage),
     )  # fmt: skip
-    _return_freed_memory()
+    return_large_arrays()
     done = False
     while not done:
         with explain_disk_errors(project, step.output, stage), acquire(step.output) as lease:
@@ -192,18 +189,6 @@ def replace_folder(output: Path, part: Path) -> None:
             old.rename(output)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _return_freed_memory() -> None:
-    """Make glibc return freed arrays of 4 MB and more to the system.
-
-    By default it keeps freed arrays of up to 32 MB for the process, together a fifth of the joint
-    stage's peak at 1,000 frames. Without effect for other C libraries.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
-    if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _RETURNED_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _RETURNED_BYTES)
 
 
 def run_studio(project: Project, sequence: str) -> Path:
