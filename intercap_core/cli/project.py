@@ -192,6 +192,52 @@ def calibrate(
     typer.echo(f"written: {path}\npicture and table: {page}")
 
 
+@app.command()
+def scan(
+    settings: Settings,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the object.")],
+    sequences: Annotated[
+        list[str],
+        typer.Argument(metavar="SEQUENCE...", help="Recordings in which a person turns it."),
+    ],
+    output: Annotated[
+        Path | None, typer.Option(help="File of the mesh (.ply); default: objects/NAME.ply.")
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="The detector's class of the object; may repeat. Default: any object."),
+    ] = None,
+    improve: Annotated[
+        bool,
+        typer.Option(
+            "--improve", help="Improve the mesh of objects.yaml by the tracked sequences."
+        ),
+    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite an existing mesh.")] = False,
+) -> None:
+    """Make a closed, coloured mesh of an object from recordings with depth.
+
+    A person picks the object up and turns it so that every side faces the cameras, also its
+    underside; several recordings with different grips may be joined. Hands and furniture are left
+    out. An object that only stands before the cameras is scanned too, with a flat underside. Writes
+    the mesh, an entry of objects.yaml with a proposed symmetry, and a page with pictures; nothing is
+    written if a quarter of the surface was never measured, and the message names what to record
+    instead.
+
+    Examples: intercap scan lab/config.yaml kettle turn_kettle_01 --label bottle;
+    intercap scan lab/config.yaml kettle turn_kettle_01 turn_kettle_02 --replace;
+    intercap scan lab/config.yaml kettle drink_01 --improve --output kettle_better.ply
+    """
+    project = open_project(settings)
+    from intercap_core.commands.scan import scan as run_scan
+
+    _, path, page = run_scan(
+        project, name, sequences, output=output, labels=label or [], improve=improve,
+        replace=replace,
+    )  # fmt: skip
+    typer.echo(f"written: {path}\npictures and figures: {page}")
+
+
 @app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
 )

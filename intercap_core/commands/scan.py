@@ -1,0 +1,259 @@
+"""`intercap scan`: mesh of an object from recordings of a person who turns it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+import yaml
+from scipy.spatial.transform import Rotation
+
+from intercap_core import artefacts
+from intercap_core.annotation import ObjectPose
+from intercap_core.body.artefact import load_model, read_parameters
+from intercap_core.commands.console import print_plain, standard_console
+from intercap_core.entries import ObjectEntry
+from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.output.site.scan_page import scan_page
+from intercap_core.pipeline.step import run_step
+from intercap_core.project import Project
+from intercap_core.scan.alignment import track_from
+from intercap_core.scan.fusion import Posed, fuse
+from intercap_core.scan.handled import Chain, cloud_of, find_handled, is_still
+from intercap_core.scan.result import ScannedMesh, finish, simplified
+from intercap_core.scan.surfaces import Recording
+from intercap_core.scan.volume import ClosedSurface
+from intercap_core.schemas import BODY_FIT, OBJECT_TRACK
+from intercap_core.stages import object_track
+
+READ = ("frames", "detections", "scene", "person")
+ROUNDS = 2  # of tracking and fusion; a third changes no figure (bench)
+TRACKED_VOXEL_M, TRACKED_FACES = 0.004, 1500  # of the mesh that is tracked
+MIN_TRACKED = 10  # frame sets with a pose
+MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
+
+
+def scan(
+    project: Project,
+    name: str,
+    sequences: Sequence[str],
+    *,
+    output: Path | None = None,
+    labels: Sequence[str] = (),
+    improve: bool = False,
+    replace: bool = False,
+) -> tuple[ScannedMesh, Path, Path]:
+    """Scan an object; write its mesh, its entry in objects.yaml and a page, and print a summary.
+
+    Returns the mesh, its file and the page. Raises UserError if the file exists, or if the
+    recordings do not show the object as needed.
+
+    Args:
+        name: of the object.
+        sequences: recordings in which a person turns the object; the first one defines its frame.
+        output: file of the mesh; default: objects/NAME.ply next to the settings.
+        labels: detector classes of the object; default: those of objects.yaml, or any.
+        improve: the poses are those of the object's mesh in objects.yaml, whose frame is kept.
+        replace: overwrite an existing file.
+    """
+    for sequence in sequences:
+        project.require_sequence(sequence)
+    path = output or project.path.parent / "objects" / f"{name}.ply"
+    if path.exists() and not replace:
+        raise UserError(
+            f"{path}: exists and is not replaced; name another file (--output), or give --replace"
+        )
+    entry = project.objects.get(name)
+    if improve:
+        _require_tracked(project, name, sequences)
+    labels = tuple(labels) or (() if entry is None else entry.labels)
+    places = project.results / "scan" / name
+    with ExitStack() as opened:
+        recordings = [_open(project, sequence, labels, opened) for sequence in sequences]
+        shown = [find_handled(recording, name) for recording in recordings]
+        if improve:
+            parts = [
+                Posed(r, views, _poses(run_step("object_track", project, sequence, keep=True)))
+                for r, views, sequence in zip(recordings, shown, sequences, strict=True)
+            ]
+            mesh = finish(fuse(parts), parts, None)
+        else:
+            mesh = _scan(project, recordings, shown, name, labels, places)
+    _require_measured(mesh, name, sequences)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(_ply(mesh.vertices, mesh.faces, mesh.colours))
+    page = places / "scan.html"
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(scan_page(name, sequences, mesh), encoding="utf-8")
+    _enter(project, name, labels, mesh, path)
+    lines = [f"  {key}: {value}" for key, value in mesh.figures().items()]
+    print_plain(standard_console(), "\n".join([f"scan of {name}", *lines]))
+    return mesh, path, page
+
+
+def _require_tracked(project: Project, name: str, sequences: Sequence[str]) -> None:
+    """Raise UserError unless the sequences track the object ``name``."""
+    for sequence in sequences:
+        if project.sequences[sequence].object != name:
+            raise UserError(
+                f"sequence {sequence}: its column 'object' is "
+                f"{project.sequences[sequence].object or 'empty'!r}, and --improve needs the track "
+                f"of {name!r}; name a sequence of this object"
+            )
+
+
+def _open(project: Project, sequence: str, labels: Sequence[str], opened: ExitStack) -> Recording:
+    """Run the stages that a scan needs, and open their artefacts."""
+    for stage in (*READ, "body_fit"):
+        run_step(stage, project, sequence, keep=True)
+    frames = opened.enter_context(Frames.open(project.artefact(sequence, "frames")))
+    paths = (project.artefact(sequence, stage) for stage in READ[1:])
+    recording = Recording(frames, *paths, _skin(project, sequence), labels)
+    if not recording.cameras:
+        raise UserError(
+            f"sequence {sequence}: no camera measures depth, and a scan needs it; record the object "
+            "with depth cameras"
+        )
+    return recording
+
+
+def _skin(project: Project, sequence: str) -> Callable[[int], np.ndarray]:
+    """Function that returns the vertices (V, 3) of the fitted body at a moment."""
+    gender = project.subjects[project.sequences[sequence].subject].gender
+    with artefacts.read(project.artefact(sequence, "body_fit"), BODY_FIT) as source:
+        model = load_model(project.config.body_models, gender, source)
+        vectors = read_parameters(source).vector()
+
+    def vertices(t: int) -> np.ndarray:
+        with torch.no_grad():
+            return np.asarray(model.forward(model.parameters(vectors[[t]])).vertices[0])
+
+    return vertices
+
+
+def _scan(
+    project: Project,
+    recordings: Sequence[Recording],
+    shown: Sequence[Chain],
+    name: str,
+    labels: Sequence[str],
+    places: Path,
+) -> ScannedMesh:
+    """Track and fuse the object in turns, beginning with the frame set that shows most of it."""
+    clouds = {t: cloud_of(views) for t, views in shown[0].items()}
+    seed = max(clouds, key=lambda t: len(clouds[t].points))
+    extent = float(np.ptp(clouds[seed].points, axis=0).max())
+    poses: Mapping[int, np.ndarray] = track_from(clouds, seed, max(0.004, extent / 100))
+    up = recordings[0].zup_from_master[2, :3]  # the object's frame has the master's axes
+    if len(shown) == 1 and is_still(shown[0]):
+        parts = [Posed(recordings[0], shown[0], dict.fromkeys(shown[0], poses[seed]))]
+        return finish(fuse(parts, up=up), parts, up)
+    surface = fuse([Posed(recordings[0], shown[0], poses)], finest_m=TRACKED_VOXEL_M)
+    for round_ in range(ROUNDS):
+        entry = _tracked_entry(surface, name, labels, places)
+        parts = []
+        for recording, views in zip(recordings, shown, strict=True):
+            known = [_pose_of(seed, poses[seed])] if recording is recordings[0] else []
+            track = _track(project, recording, entry, known, places)
+            parts.append(Posed(recording, views, _poses(track)))
+            _require_poses(parts[-1], name)
+        poses = {seed: poses[seed]} | dict(parts[0].poses)
+        last = round_ == ROUNDS - 1
+        surface = fuse(parts) if last else fuse(parts, finest_m=TRACKED_VOXEL_M)
+    return finish(surface, parts, poses[seed][:3, :3].T @ up)
+
+
+def _tracked_entry(
+    surface: ClosedSurface, name: str, labels: Sequence[str], places: Path
+) -> ObjectEntry:
+    """Entry of a simplified mesh, written to ``places``."""
+    path = places / "tracked.ply"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(_ply(*simplified(surface, TRACKED_FACES)))
+    return ObjectEntry(name=name, mesh=path, labels=tuple(labels))
+
+
+def _pose_of(frame: int, pose: np.ndarray) -> ObjectPose:
+    """A pose (4, 4) as an annotation."""
+    a, b, c = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
+    x, y, z = pose[:3, 3].tolist()
+    return ObjectPose(frame=frame, rotation_vector=(a, b, c), translation=(x, y, z))
+
+
+def _track(
+    project: Project,
+    recording: Recording,
+    entry: ObjectEntry,
+    known: Sequence[ObjectPose],
+    places: Path,
+) -> Path:
+    """Run stage ``object_track`` with the mesh of ``entry``; returns its artefact."""
+    sequence = recording.frames.sequence
+    output = places / f"{sequence}.h5"
+    object_track.run(
+        **{stage: project.artefact(sequence, stage) for stage in READ},
+        output=output, object_=entry, settings=project.config.object_track, poses=known,
+    )  # fmt: skip
+    return output
+
+
+def _poses(track: Path) -> dict[int, np.ndarray]:
+    """Poses master_from_object (4, 4) of the frame sets in which the object is not lost."""
+    with artefacts.read(track, OBJECT_TRACK) as source:
+        rotation, translation = source["rotation"], source["translation"]
+        sure = ~(source["lost"] | source["gone"]) & np.isfinite(translation).all(1)
+    return {int(t): rigid(rotation[t], translation[t]) for t in np.flatnonzero(sure)}
+
+
+def _require_poses(part: Posed, name: str) -> None:
+    if len(part.sets) < MIN_TRACKED:
+        raise UserError(
+            f"sequence {part.recording.frames.sequence}: {name!r} can be followed in "
+            f"{len(part.sets)} of the {len(part.surfaces)} frame sets that show it, expected at "
+            f"least {MIN_TRACKED}; turn it more slowly, and hold it with few fingers"
+        )
+
+
+def _require_measured(mesh: ScannedMesh, name: str, sequences: Sequence[str]) -> None:
+    """Raise UserError if too much of the surface was never measured."""
+    if mesh.closed_share > MAX_CLOSED:
+        raise UserError(
+            f"object {name!r}: no camera measured {mesh.closed_share:.0%} of its surface in "
+            f"{', '.join(sequences)}, in which it turned by {mesh.turned_deg:.0f} degrees; at most "
+            f"{MAX_CLOSED:.0%} is closed. Turn it so that every side faces the cameras, also its "
+            "underside, or add a recording in which it is held in another place"
+        )
+
+
+def _ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> bytes:
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    return bytes(mesh.export(file_type="ply"))
+
+
+def _enter(
+    project: Project, name: str, labels: Sequence[str], mesh: ScannedMesh, path: Path
+) -> None:
+    """Append the object to objects.yaml, or print its entry if the file has one."""
+    file = project.path.parent / project.config.objects
+    symmetry = mesh.symmetry.symmetry.model_dump(mode="json", exclude_defaults=True)
+    content: dict[str, object] = {"mesh": os.path.relpath(path, file.parent)}
+    if symmetry:
+        content["symmetry"] = symmetry
+    if labels:
+        content["labels"] = list(labels)
+    text = yaml.safe_dump({name: content}, sort_keys=False, default_flow_style=None)
+    if name in project.objects:
+        print_plain(
+            standard_console(), f"{file} has an entry {name!r}; of this mesh it is:\n{text}"
+        )
+        return
+    before = file.read_text(encoding="utf-8")
+    file.write_text(before + "\n" * (not before.endswith("\n")) + text, encoding="utf-8")
+    print_plain(standard_console(), f"added to {file}:\n{text}")

@@ -1,0 +1,58 @@
+"""Page on a scanned object: pictures from six sides, and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.output.site import embed
+from intercap_core.output.site.drawing import (
+    ColouredMesh,
+    EncodedImage,
+    draw,
+    encode_jpeg,
+    look_along,
+)
+from intercap_core.scan.result import ScannedMesh
+
+_SIZE = 320  # px of a picture
+_UNMEASURED = (0.95, 0.55, 0.10)
+_SIDES = {
+    "from the front": (0, 1, 0),
+    "from the right": (-1, 0, 0),
+    "from behind": (0, -1, 0),
+    "from the left": (1, 0, 0),
+    "from above": (0, 0, -1),
+    "from below": (0, 0, 1),
+}
+
+
+def scan_page(name: str, sequences: Sequence[str], mesh: ScannedMesh) -> str:
+    """HTML page of a scan."""
+    return embed.render(
+        "scan.html.j2",
+        {
+            "name": name,
+            "sequences": sequences,
+            "pictures": [_picture(mesh, side) for side in _SIDES],
+            "figures": mesh.figures(),
+        },
+    )
+
+
+def _picture(mesh: ScannedMesh, side: str) -> EncodedImage:
+    """Picture of the mesh from one side; surfaces without a measurement are orange."""
+    away = np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * 2.5
+    direction = np.array(_SIDES[side], float)
+    up = np.array([0.0, 1, 0]) if direction[2] else np.array([0.0, 0, 1])
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    rotation = look_along(direction, up)
+    pose = rigid(rotation, -rotation @ (middle - away * direction))
+    focal, centre = 2.2 * _SIZE, (_SIZE - 1) / 2
+    lens = Intrinsics(_SIZE, _SIZE, focal, focal, centre, centre)
+    colours = np.where(mesh.measured[:, None], mesh.colours / 255.0, _UNMEASURED)
+    drawn = draw([ColouredMesh(mesh.vertices, mesh.faces, pose, colours=colours)], lens)
+    return encode_jpeg(drawn.over(np.ones((_SIZE, _SIZE, 3))), side)

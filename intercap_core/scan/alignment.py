@@ -1,0 +1,155 @@
+"""Poses of an object of unknown shape: registration of each frame set to a model of the others.
+
+Frame-to-model tracking (KinectFusion, ISMAR 2011) on points: the model is the mean of all points
+registered so far, in cells of the object's frame. A frame set is registered by point-to-plane ICP
+(Chen and Medioni, 1992) with a robust weight. These poses serve a first, rough mesh; the object's
+tracker finds the poses of all frame sets with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp
+
+REACH_M = 0.03  # largest distance of corresponding points in tracking: motion between frame sets
+NOISE_M = 0.003  # scale of the robust weight: noise of depth and of the rig's poses (data sheet)
+FACING = 0.5  # least cosine between corresponding normals: the two sides of a plate do not match
+# Standard deviations of the motion between frame sets, rad and metres. Weaker than 30 points, but
+# they determine turns about an axis of symmetry.
+PRIOR = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
+MAX_POINTS = 3000  # of a frame set in its registration
+GOOD_SHARE = 0.85  # least share of points that correspond, of a registered frame set
+STEPS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Oriented points: (N, 3) each, metres."""
+
+    points: np.ndarray
+    normals: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Cloud]) -> Cloud:
+        """All points of several clouds."""
+        return cls(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("points", "normals")))
+
+    def moved(self, target_from_source: np.ndarray) -> Cloud:
+        """The cloud in another frame, by a transform (4, 4)."""
+        rotated = self.normals @ target_from_source[:3, :3].T
+        return Cloud(apply(target_from_source, self.points), rotated)
+
+    def subset(self, index: np.ndarray) -> Cloud:
+        """The points of indices or of a mask."""
+        return Cloud(self.points[index], self.normals[index])
+
+    def thinned(self, cell_m: float) -> Cloud:
+        """Mean point and normal of each cell. Opposite surfaces in a cell are kept apart."""
+        octants = (self.normals > 0) @ np.array([1, 2, 4])
+        keys = np.column_stack([np.floor(self.points / cell_m), octants]).astype(np.int64)
+        _, cell, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        cell = cell.ravel()
+        points, normals = (
+            np.stack([np.bincount(cell, values[:, k]) for k in range(3)], 1) / count[:, None]
+            for values in (self.points, self.normals)
+        )
+        length = np.linalg.norm(normals, axis=1)
+        kept = length > 0.3  # of a cell whose normals agree
+        return Cloud(points[kept], normals[kept] / length[kept, None])
+
+
+class Model:
+    """Nearest neighbours in the cloud of an object, in its frame."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self.cloud = cloud
+        self._tree = cKDTree(cloud.points)
+
+    def register(
+        self, cloud: Cloud, start: np.ndarray, reach_m: float = REACH_M
+    ) -> tuple[np.ndarray, float]:
+        """Pose of the object that aligns a cloud in the master frame with the model.
+
+        Returns the pose master_from_object (4, 4), and the share of the points that correspond to
+        a point of the model within three times :data:`NOISE_M`.
+
+        Args:
+            cloud: points that show the object, master frame.
+            start: (4, 4) master_from_object.
+            reach_m: largest distance of corresponding points in the first step. It shrinks to
+                three times the noise.
+        """
+        object_from_master = invert(start)
+        about = apply(object_from_master, cloud.points.mean(0)[None])[0]
+        precision = np.diag(PRIOR**-2)
+        moved_by = np.zeros(6)
+        share = 0.0
+        for step in range(STEPS):
+            reach = max(reach_m * 0.8**step, 3 * NOISE_M)
+            own = cloud.moved(object_from_master)
+            distance, near = self._tree.query(own.points, distance_upper_bound=reach)
+            near[~np.isfinite(distance)] = 0
+            normals = self.cloud.normals[near]
+            agree = np.isfinite(distance) & ((own.normals * normals).sum(1) > FACING)
+            share = float((agree & (distance < 3 * NOISE_M)).mean())
+            if agree.sum() < 20:
+                break
+            points, normals = own.points[agree], normals[agree]
+            residual = (normals * (points - self.cloud.points[near[agree]])).sum(1)
+            scale = max(NOISE_M, reach / 6)
+            weight = (scale / (scale**2 + residual**2)) ** 2  # Geman-McClure, over the variance
+            jacobian = np.concatenate([np.cross(points - about, normals), normals], 1)
+            matrix = (jacobian * weight[:, None]).T @ jacobian + precision
+            change = -np.linalg.solve(
+                matrix, jacobian.T @ (weight * residual) + precision @ moved_by
+            )
+            moved_by = moved_by + change
+            turn = rotation_exp(change[:3])
+            step_about = rigid(turn, about + change[3:] - turn @ about)
+            object_from_master = step_about @ object_from_master
+            if step > 5 and np.abs(change).max() < 1e-5:
+                break
+        return invert(object_from_master), share
+
+
+def some(cloud: Cloud, count: int = MAX_POINTS) -> Cloud:
+    """At most ``count`` points, evenly over the order of the points."""
+    if len(cloud.points) <= count:
+        return cloud
+    return cloud.subset(np.linspace(0, len(cloud.points) - 1, count).astype(int))
+
+
+def track_from(clouds: Mapping[int, Cloud], seed: int, cell_m: float) -> dict[int, np.ndarray]:
+    """Poses of the object around a frame set, as long as the registration is good.
+
+    The object's frame has the master's axes. Its origin is the mean of the points at the seed.
+
+    Args:
+        clouds: points that show the object by frame set, master frame.
+        seed: frame set that defines the object's frame.
+        cell_m: cell of the model, metres.
+
+    Returns:
+        Poses master_from_object (4, 4) of the registered frame sets.
+    """
+    first = np.eye(4)
+    first[:3, 3] = clouds[seed].points.mean(0)
+    poses = {seed: first}
+    model = Model(clouds[seed].moved(invert(first)).thinned(cell_m))
+    order = sorted(clouds)
+    at = order.index(seed)
+    for way in (order[at + 1 :], order[:at][::-1]):
+        last = first
+        for t in way:
+            pose, share = model.register(some(clouds[t]), last)
+            if share < GOOD_SHARE:
+                break
+            poses[t] = last = pose
+            own = clouds[t].moved(invert(pose))
+            model = Model(Cloud.joined([model.cloud, own]).thinned(cell_m))
+    return poses

@@ -1,0 +1,137 @@
+"""The mesh of an object from recordings with known poses of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.scan.handled import Chain
+from intercap_core.scan.surfaces import OBJECT, OTHER, UNKNOWN, Recording, ViewSurface
+from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
+
+MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurements mix surfaces
+SAME_SURFACE_M = 0.015  # difference of neighbouring depths on one surface
+MARGIN_M = 0.02  # of the grid around the points
+FINEST_M = 0.002  # voxel; noise of the averaged surface is not finer
+LOWEST = 0.5  # percentile of the points' heights on which an object stands
+VOXELS_ALONG = 250  # most voxels along the object
+COLOURED_SETS = 12  # frame sets whose images give the colours
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A recording, and what is known of the object in it."""
+
+    recording: Recording
+    surfaces: Chain
+    """Points that show the object, by frame set."""
+    poses: Mapping[int, np.ndarray]
+    """master_from_object (4, 4) by frame set."""
+
+    @property
+    def sets(self) -> list[int]:
+        """Frame sets with a pose and points of the object."""
+        return sorted(self.poses.keys() & self.surfaces.keys())
+
+    def points(self, t: int) -> np.ndarray:
+        """Points (N, 3) of all cameras in the object's frame."""
+        views = np.concatenate([view.points for view in self.surfaces[t]])
+        return apply(invert(self.poses[t]), views)
+
+
+def fuse(
+    parts: Sequence[Posed], *, up: np.ndarray | None = None, finest_m: float = FINEST_M
+) -> ClosedSurface:
+    """Closed surface from all recordings, in the object's frame.
+
+    Args:
+        parts: recordings with poses of the object.
+        up: (3,) direction up in the object's frame, of an object that always stands on its
+            underside; below its lowest points is no object. None = it was lifted.
+        finest_m: least voxel, metres.
+    """
+    points = np.concatenate([part.points(t) for part in parts for t in part.sets])
+    low, high = np.percentile(points, (0.2, 99.8), axis=0)
+    voxel = max(finest_m, float((high - low).max()) / VOXELS_ALONG)
+    low, high = low - MARGIN_M, high + MARGIN_M
+    volume = Volume(low, high, voxel)
+    box = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    for part in parts:
+        for t in part.sets:
+            views = {view.camera: view for view in part.surfaces[t]}
+            for c in part.recording.cameras:
+                image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)
+                if image is not None:
+                    volume.integrate(image)
+    if up is not None:
+        volume.exclude_below(up, float(np.percentile(points @ up, LOWEST)))
+    return volume.surface()
+
+
+def _labelled(
+    recording: Recording,
+    t: int,
+    c: int,
+    view: ViewSurface | None,
+    pose: np.ndarray,
+    box: np.ndarray,
+) -> LabelledDepth | None:
+    """The window of a depth image that shows the object's box; None without an image of it.
+
+    Args:
+        view: points that show the object in this image; None if there are none.
+        pose: (4, 4) master_from_object.
+        box: (8, 3) corners around the object, its frame.
+    """
+    depth, camera = recording.depth(t, c), recording.rig[c]
+    lens = camera.depth
+    if depth is None or lens is None:
+        return None
+    depth_from_object = camera.depth_from_master @ pose
+    local = apply(depth_from_object, box)
+    if not lens.sees(local).all():
+        return None
+    kind = np.where(depth > 0, OTHER, UNKNOWN).astype(np.uint8)
+    weight = np.ones(depth.shape, np.float32)
+    if view is not None:
+        mask = np.zeros(depth.shape, np.uint8)
+        mask.ravel()[view.pixels] = 1
+        kind[cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0] = UNKNOWN  # mixed pixels of the edge
+        towards = camera.master_from_depth[:3, 3] - view.points
+        cosine = (towards * view.normals).sum(1) / np.linalg.norm(towards, axis=1)
+        kind.ravel()[view.pixels[cosine > MIN_COSINE]] = OBJECT
+        weight.ravel()[view.pixels] = cosine**2
+    depth = cv2.bilateralFilter(depth, 5, SAME_SURFACE_M, 2.0)  # averages about ten pixels
+    # a pinhole image of the box, so that each voxel is projected by two divisions
+    rays = local[:, :2] / local[:, 2:]
+    first, last = rays.min(0), rays.max(0)
+    width, height = np.ceil((last - first) * (lens.fx, lens.fy)).astype(int) + 1
+    row, column = np.mgrid[:height, :width]
+    x, y = first[0] + column / lens.fx, first[1] + row / lens.fy
+    source = lens.project(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)).astype(np.float32)
+    source = source.reshape(height, width, 2)
+    images = (cv2.remap(part, source, None, cv2.INTER_NEAREST) for part in (depth, kind, weight))
+    pinhole = (lens.fx, lens.fy, -first[0] * lens.fx, -first[1] * lens.fy)
+    return LabelledDepth(*images, pinhole, depth_from_object)
+
+
+def vertex_colours(vertices: np.ndarray, parts: Sequence[Posed]) -> np.ndarray:
+    """Colours (V, 3) uint8, sRGB: the median of the nearest five coloured points of each vertex."""
+    points, colours = [], []
+    for part in parts:
+        for t in part.sets[:: max(1, len(part.sets) // COLOURED_SETS)]:
+            for view in part.surfaces[t]:
+                image = part.recording.frames.colour(t, view.camera)
+                if image is None:
+                    continue
+                points.append(apply(invert(part.poses[t]), view.points))
+                colours.append(image.reshape(-1, 3)[view.colour_pixels])
+    if not points:
+        return np.full((len(vertices), 3), 128, np.uint8)
+    _, near = cKDTree(np.concatenate(points)).query(vertices, 5)
+    return np.median(np.concatenate(colours)[near], axis=1)[:, ::-1].astype(np.uint8)
