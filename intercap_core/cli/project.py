@@ -220,8 +220,8 @@ def scan(
     A person picks the object up and turns it so that every side faces the cameras, also its
     underside; several recordings with different grips may be joined. Hands and furniture are left
     out. An object that only stands before the cameras is scanned too, with a flat underside. Writes
-    the mesh, an entry of objects.yaml with a proposed symmetry, and a page with pictures; nothing is
-    written if a quarter of the surface was never measured, and the message names what to record
+    the mesh, an entry of objects.yaml with a proposed symmetry, and a page with pictures. Nothing
+    is written if a quarter of the surface was never measured; the message names what to record
     instead.
 
     Examples: intercap scan lab/config.yaml kettle turn_kettle_01 --label bottle;

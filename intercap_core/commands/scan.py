@@ -35,7 +35,7 @@ from intercap_core.stages import object_track
 
 READ = ("frames", "detections", "scene", "person")
 ROUNDS = 2  # of tracking and fusion; a third changes no figure (bench)
-TRACKED_VOXEL_M, TRACKED_FACES = 0.004, 1500  # of the mesh that is tracked
+TRACKED_VOXELS, TRACKED_FACES = 100, 1500  # along the mesh that is tracked; of it
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
 
@@ -114,12 +114,18 @@ def _open(project: Project, sequence: str, labels: Sequence[str], opened: ExitSt
     for stage in (*READ, "body_fit"):
         run_step(stage, project, sequence, keep=True)
     frames = opened.enter_context(Frames.open(project.artefact(sequence, "frames")))
-    paths = (project.artefact(sequence, stage) for stage in READ[1:])
-    recording = Recording(frames, *paths, _skin(project, sequence), labels)
+    recording = Recording(
+        frames,
+        project.artefact(sequence, "detections"),
+        project.artefact(sequence, "scene"),
+        project.artefact(sequence, "person"),
+        _skin(project, sequence),
+        labels,
+    )
     if not recording.cameras:
         raise UserError(
-            f"sequence {sequence}: no camera measures depth, and a scan needs it; record the object "
-            "with depth cameras"
+            f"sequence {sequence}: no camera measures depth, and a scan needs it; record the "
+            "object with depth cameras"
         )
     return recording
 
@@ -155,7 +161,7 @@ def _scan(
     if len(shown) == 1 and is_still(shown[0]):
         parts = [Posed(recordings[0], shown[0], dict.fromkeys(shown[0], poses[seed]))]
         return finish(fuse(parts, up=up), parts, up)
-    surface = fuse([Posed(recordings[0], shown[0], poses)], finest_m=TRACKED_VOXEL_M)
+    surface = fuse([Posed(recordings[0], shown[0], poses)], along=TRACKED_VOXELS)
     for round_ in range(ROUNDS):
         entry = _tracked_entry(surface, name, labels, places)
         parts = []
@@ -166,7 +172,7 @@ def _scan(
             _require_poses(parts[-1], name)
         poses = {seed: poses[seed]} | dict(parts[0].poses)
         last = round_ == ROUNDS - 1
-        surface = fuse(parts) if last else fuse(parts, finest_m=TRACKED_VOXEL_M)
+        surface = fuse(parts) if last else fuse(parts, along=TRACKED_VOXELS)
     return finish(surface, parts, poses[seed][:3, :3].T @ up)
 
 
@@ -234,7 +240,9 @@ def _require_measured(mesh: ScannedMesh, name: str, sequences: Sequence[str]) ->
 
 def _ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> bytes:
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
-    return bytes(mesh.export(file_type="ply"))
+    content = mesh.export(file_type="ply")
+    assert isinstance(content, bytes)
+    return content
 
 
 def _enter(

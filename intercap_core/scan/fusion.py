@@ -18,8 +18,9 @@ MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurem
 SAME_SURFACE_M = 0.015  # difference of neighbouring depths on one surface
 MARGIN_M = 0.02  # of the grid around the points
 FINEST_M = 0.002  # voxel; noise of the averaged surface is not finer
+FUSED_SETS = 60  # frame sets of a recording that are fused, at most twice as many
 LOWEST = 0.5  # percentile of the points' heights on which an object stands
-VOXELS_ALONG = 250  # most voxels along the object
+VOXELS_ALONG = 250  # along the longest side of the object
 COLOURED_SETS = 12  # frame sets whose images give the colours
 
 
@@ -45,7 +46,7 @@ class Posed:
 
 
 def fuse(
-    parts: Sequence[Posed], *, up: np.ndarray | None = None, finest_m: float = FINEST_M
+    parts: Sequence[Posed], *, up: np.ndarray | None = None, along: int = VOXELS_ALONG
 ) -> ClosedSurface:
     """Closed surface from all recordings, in the object's frame.
 
@@ -53,16 +54,16 @@ def fuse(
         parts: recordings with poses of the object.
         up: (3,) direction up in the object's frame, of an object that always stands on its
             underside; below its lowest points is no object. None = it was lifted.
-        finest_m: least voxel, metres.
+        along: voxels along the longest side of the object.
     """
     points = np.concatenate([part.points(t) for part in parts for t in part.sets])
     low, high = np.percentile(points, (0.2, 99.8), axis=0)
-    voxel = max(finest_m, float((high - low).max()) / VOXELS_ALONG)
+    voxel = max(FINEST_M, float((high - low).max()) / along)
     low, high = low - MARGIN_M, high + MARGIN_M
     volume = Volume(low, high, voxel)
     box = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     for part in parts:
-        for t in part.sets:
+        for t in part.sets[:: max(1, len(part.sets) // FUSED_SETS)]:
             views = {view.camera: view for view in part.surfaces[t]}
             for c in part.recording.cameras:
                 image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)
@@ -113,11 +114,16 @@ def _labelled(
     width, height = np.ceil((last - first) * (lens.fx, lens.fy)).astype(int) + 1
     row, column = np.mgrid[:height, :width]
     x, y = first[0] + column / lens.fx, first[1] + row / lens.fy
-    source = lens.project(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)).astype(np.float32)
-    source = source.reshape(height, width, 2)
-    images = (cv2.remap(part, source, None, cv2.INTER_NEAREST) for part in (depth, kind, weight))
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    u, v = lens.project(rays).astype(np.float32).T.reshape(2, height, width)
+
+    def resampled(image: np.ndarray) -> np.ndarray:
+        return np.asarray(cv2.remap(image, u, v, cv2.INTER_NEAREST))
+
     pinhole = (lens.fx, lens.fy, -first[0] * lens.fx, -first[1] * lens.fy)
-    return LabelledDepth(*images, pinhole, depth_from_object)
+    return LabelledDepth(
+        resampled(depth), resampled(kind), resampled(weight), pinhole, depth_from_object
+    )
 
 
 def vertex_colours(vertices: np.ndarray, parts: Sequence[Posed]) -> np.ndarray:

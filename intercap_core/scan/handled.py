@@ -14,7 +14,7 @@ MAX_SETS = 150  # frame sets of a recording that are used, evenly spaced
 # Least distance between places of an object that was moved, metres. Middles of objects at rest move
 # by 3 cm when a person hides a part of them (bench).
 MOVED_M = 0.08
-# Largest distance of an object's middle between two frame sets, metres: hands at 2 m/s at 15 a second
+# Largest way of an object's middle from one frame set to the next, metres: 2 m/s at 15 a second
 STEP_M = 0.15
 
 Parts = list[list[ViewSurface]]
@@ -50,9 +50,9 @@ def find_handled(recording: Recording, name: str) -> Chain:
         if len(often) == 1:
             return often[0]
         raise UserError(
-            f"{where}: nothing moves among the candidates ({shown}), and {len(often)} objects stand "
-            f"still, so that it is not known which is {name!r}; record a person who picks it up and "
-            "turns it, or name its detector class (--label)"
+            f"{where}: nothing moves among the candidates ({shown}), and {len(often)} objects "
+            f"stand still, so that it is not known which is {name!r}; record a person who picks it "
+            "up and turns it, or name its detector class (--label)"
         )
     object_ = chains[0]
     for other in chains[1:]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +82,10 @@ def propose_symmetry(vertices: np.ndarray, faces: np.ndarray) -> ProposedSymmetr
     return ProposedSymmetry(Symmetry(discrete=matrices), words)
 
 
-def _discrete(axes: np.ndarray, distance) -> Iterator[tuple[np.ndarray, str]]:  # type: ignore[no-untyped-def]
+def _discrete(
+    axes: np.ndarray, distance: Callable[[np.ndarray, np.ndarray], float]
+) -> Iterator[tuple[np.ndarray, str]]:
+    """Turns of the highest order about each axis, and words on them."""
     for axis, name in zip(axes, "zxy", strict=True):
         for order in reversed(ORDERS):
             angle = 2 * np.pi / order
