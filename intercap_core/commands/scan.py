@@ -161,7 +161,7 @@ def _scan(
     if len(shown) == 1 and is_still(shown[0]):
         parts = [Posed(recordings[0], shown[0], dict.fromkeys(shown[0], poses[seed]))]
         return finish(fuse(parts, up=up), parts, up)
-    surface = fuse([Posed(recordings[0], shown[0], poses)], along=TRACKED_VOXELS)
+    surface = fuse([Posed(recordings[0], shown[0], poses)], up=up, along=TRACKED_VOXELS)
     for round_ in range(ROUNDS):
         entry = _tracked_entry(surface, name, labels, places)
         parts = []

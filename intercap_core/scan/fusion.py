@@ -52,8 +52,8 @@ def fuse(
 
     Args:
         parts: recordings with poses of the object.
-        up: (3,) direction up in the object's frame, of an object that always stands on its
-            underside; below its lowest points is no object. None = it was lifted.
+        up: (3,) direction up in the object's frame, if no frame set shows the underside: the
+            object ends at its lowest points. None = it was lifted and turned.
         along: voxels along the longest side of the object.
     """
     points = np.concatenate([part.points(t) for part in parts for t in part.sets])
