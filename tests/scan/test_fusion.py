@@ -1,0 +1,72 @@
+"""Fusion of depth images with known poses: size, closedness, thin walls, holes, colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.scan.fusion import Posed, fuse, vertex_colours
+from tests.scan.turned_object import Turned, ring, turning
+
+BOX = trimesh.creation.box((0.12, 0.16, 0.20))
+VESSEL = trimesh.creation.annulus(0.045, 0.050, 0.12)  # a wall of 5 mm
+
+
+def posed(mesh: trimesh.Trimesh, poses: np.ndarray, **options: float) -> Posed:
+    recording = Turned([(mesh.vertices.copy(), mesh.faces.copy())], poses[None], **options)
+    surfaces = {t: recording.surfaces(t) for t in range(len(recording))}
+    return Posed(recording, surfaces, dict(enumerate(poses)))  # type: ignore[arg-type]
+
+
+def distances_mm(mesh: trimesh.Trimesh, vertices: np.ndarray) -> np.ndarray:
+    return 1e3 * DistanceField(mesh.vertices, mesh.faces).signed_distance(vertices)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.004])
+def test_a_turned_box_is_closed_and_of_its_size(noise_m: float) -> None:
+    surface = fuse([posed(BOX, turning(12, 30.0), noise_m=noise_m)])
+    found = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert found.is_watertight
+    assert found.volume == pytest.approx(BOX.volume, rel=0.04)  # positive: normals outward
+    off = distances_mm(BOX, surface.vertices)
+    assert np.quantile(abs(off), 0.9) < 2.0  # a voxel; edges are rounded
+    assert abs(np.median(off)) < 0.7
+    assert surface.measured.mean() > 0.99
+
+
+def test_a_thin_wall_keeps_its_two_sides() -> None:
+    """A surface of the mean distance of both sides would be filled, or have no wall at all."""
+    surface = fuse([posed(VESSEL, turning(12, 30.0))])
+    found = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert found.volume == pytest.approx(VESSEL.volume, rel=0.5)  # filled: five times as much
+    assert np.median(abs(distances_mm(VESSEL, surface.vertices))) < 1.5
+
+
+def test_what_no_camera_measured_is_closed_and_flagged() -> None:
+    """Cameras above the box alone: its underside is closed at its lowest points."""
+    above = [c for c in range(6) if c % 2 == 0]
+    part = posed(BOX, turning(2, 0.0))
+    part.recording.cameras[:] = above  # type: ignore[union-attr]
+    part = Posed(part.recording, {t: part.recording.surfaces(t) for t in (0, 1)}, part.poses)
+    surface = fuse([part], up=np.array([0.0, 0, 1]))
+    assert trimesh.Trimesh(surface.vertices, surface.faces).is_watertight
+    assert surface.vertices[:, 2].min() == pytest.approx(-0.10, abs=0.006)
+    below = surface.vertices[:, 2] < -0.095
+    inner = abs(surface.vertices[:, :2]).max(1) < 0.04
+    assert not surface.measured[below & inner].any()
+    above_inner = (surface.vertices[:, 2] > 0.095) & inner
+    assert surface.measured[above_inner].all()
+
+
+def test_colours_come_from_the_images() -> None:
+    part = posed(BOX, turning(3, 20.0))
+    colours = vertex_colours(BOX.vertices, [part])
+    assert (colours == (200, 20, 10)).all()  # sRGB of the images' blue, green, red
+
+
+def test_a_camera_that_does_not_see_the_whole_box_is_left_out() -> None:
+    rig = ring()
+    part = posed(BOX, turning(4, 30.0, np.tile([0.0, 0.0, 0.35], (4, 1))), rig=rig)  # type: ignore[arg-type]
+    fuse([part])
