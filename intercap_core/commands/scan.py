@@ -92,7 +92,7 @@ def scan(
     page = places / "scan.html"
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(scan_page(name, sequences, mesh), encoding="utf-8")
-    _enter(project, name, labels, mesh, path)
+    add_entry(project, name, labels, mesh, path)
     lines = [f"  {key}: {value}" for key, value in mesh.figures().items()]
     print_plain(standard_console(), "\n".join([f"scan of {name}", *lines]))
     return mesh, path, page
@@ -245,7 +245,7 @@ def _ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = N
     return content
 
 
-def _enter(
+def add_entry(
     project: Project, name: str, labels: Sequence[str], mesh: ScannedMesh, path: Path
 ) -> None:
     """Append the object to objects.yaml, or print its entry if the file has one."""

@@ -1,0 +1,75 @@
+"""`intercap scan`: its refusals before any work, and the entry of objects.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from intercap_core.commands.scan import add_entry, scan
+from intercap_core.errors import UserError
+from intercap_core.project import Project, load_project
+from intercap_core.scan.proposal import propose_symmetry
+from intercap_core.scan.result import ScannedMesh
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Project:
+    """The project of config/test, with its tables in a folder of its own."""
+    for name in ("sequences.tsv", "subjects.tsv"):
+        table = (ROOT / "config" / "test" / name).read_text()
+        (tmp_path / name).write_text(table.replace("../../results", "results"))
+    settings = yaml.safe_load((ROOT / "config" / "test" / "config.yaml").read_text())
+    settings["objects"] = "objects.yaml"
+    entries = yaml.safe_load((ROOT / "config" / "objects.yaml").read_text())
+    for entry in entries.values():
+        entry["mesh"] = str(ROOT / "config" / entry["mesh"])
+        entry.pop("contact_vertices", None)
+    (tmp_path / "objects.yaml").write_text("# our objects\n" + yaml.safe_dump(entries))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    return load_project(tmp_path / "config.yaml")
+
+
+@pytest.mark.parametrize(
+    ("sequence", "options", "message"),
+    [
+        ("cup_drink_s99", {}, "cup_drink_s99"),
+        ("cup_drink_s04", {"output": "objects.yaml"}, "exists and is not replaced.*--replace"),
+        ("cup_drink_s04", {"improve": True}, "column 'object' is 'cup'.*name a sequence of this"),
+    ],
+)
+def test_what_cannot_be_scanned_is_refused_at_once(
+    project: Project, sequence: str, options: dict[str, Any], message: str
+) -> None:
+    if "output" in options:
+        options = options | {"output": project.path.parent / options["output"]}
+    with pytest.raises(UserError, match=message):
+        scan(project, "kettle", [sequence], **options)
+    assert not project.results.exists()
+
+
+def test_a_new_object_is_added_to_the_users_file(project: Project) -> None:
+    cylinder = trimesh.creation.cylinder(0.04, 0.2)
+    vertices, faces = np.asarray(cylinder.vertices), np.asarray(cylinder.faces)
+    mesh = ScannedMesh(
+        vertices, faces, np.ones(len(vertices), bool), np.full((len(vertices), 3), 90, np.uint8),
+        propose_symmetry(vertices, faces), turned_deg=170.0, sets=40,
+    )  # fmt: skip
+    path = project.path.parent / "objects" / "kettle.ply"
+    path.parent.mkdir()
+    path.write_bytes(cylinder.export(file_type="ply"))
+    add_entry(project, "kettle", ["bottle"], mesh, path)
+    file = project.path.parent / "objects.yaml"
+    assert file.read_text().startswith("# our objects\n")  # comments are kept
+    entry = load_project(project.path).objects["kettle"]
+    assert entry.labels == ("bottle",) and entry.mesh.is_file()
+    assert [s.axis for s in entry.symmetry.continuous] == [(0.0, 0.0, 1.0)]
+    before = file.read_text()
+    add_entry(load_project(project.path), "kettle", [], mesh, path)  # the user's entry stays
+    assert file.read_text() == before
