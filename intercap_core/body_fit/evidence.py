@@ -7,7 +7,7 @@ deviation of each kind of observation, which is estimated from residuals.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -29,14 +29,20 @@ from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.matching import Matcher, PosedSkin
 from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
+from intercap_core.body_fit.self_contact import (
+    Contacts,
+    SelfContact,
+    find_contacts,
+    join_frames,
+    no_contacts,
+)
 from intercap_core.body_fit.surface import (
     COVERINGS,
     SAMPLE_SHARE,
     SkinSurface,
     choose_samples,
 )
-from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
+from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Views, keypoint_set
 from intercap_core.disk import DiskList
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.levenberg_marquardt import BLOCK_FRAMES
@@ -139,7 +145,6 @@ class Evidence:
         self.group = torch.as_tensor(self.samples.group)
         carrier = model.skinning_weights.argmax(1).numpy()
         self.sample_joints = carrier[self.samples.vertex]
-        self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
         # compiled code runs frame by frame, which threads can share
         self._threads = ThreadPool(threads_of_job())
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
@@ -317,114 +322,122 @@ class Evidence:
                 start = covering.noise
                 self.cloud_noise[g] = min(max(estimate, start * 0.1), start * 1.5)
 
-    def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Pose the bodies ``base`` (N, P), a few at a time.
-
-        Yields the index of the first of these bodies, and vertices and normals (b, R, 3) of their
-        surfaces. Those of at most 256 bodies are cached for the next call.
-        """
-        if self._posed is not None and torch.equal(self._posed[0], base):
-            yield from self._posed[1]
-            return
-        together, kept = 16, 256  # frames, limited by memory: the surface of one has 250 kB
-        self._posed, parts = None, []
-        params = self.model.parameters(base)
-        for start in range(0, len(base), together):
-            part = (start, *self.surface.posed(params.frames(slice(start, start + together))))
-            if len(base) <= kept:
-                parts.append(part)
-            yield part
-        if parts:
-            self._posed = (base.clone(), parts)
-
-    def find_pairs(self, problem: BodyProblem) -> Pairs | None:
-        """Return the samples inside another part of the body (:class:`.term_inputs.Pairs`).
-
-        None if there are none or the term is switched off.
-        """
-        if not problem.self_weight:
-            return None
-        ids = torch.as_tensor(self.surface.ids)
-        problem.pairs, contacts = None, []  # those of the last search are not used
-        for _, vertices, normals in self._bodies(problem.base):
-            contacts += self._threads.map(
-                lambda posed: find_contacts(self._self_contact, *posed),
-                list(zip(vertices, normals, strict=True)),
-            )
-        return join_frames([(ids[inner], ids[outer], normal) for inner, outer, normal in contacts])
-
-    def match(
+    def observe_skin(
         self,
         problem: BodyProblem,
         reach: float,
+        *,
+        places: np.ndarray | None = None,
         only: np.ndarray | None = None,
         keep_views: bool = True,
-    ) -> CloudRows:
-        """Match the points of all frames to the problem's bodies, and return the rows of E_D.
+        pairs: bool = True,
+        depth_points_only: bool = False,
+    ) -> None:
+        """Match the clouds to the problem's bodies, and search their self-contacts.
+
+        Sets the problem's rows of E_D, None without clouds, and its pairs, None if there are none.
 
         Args:
-            problem: the bodies.
+            problem: the bodies, changed in place.
             reach: largest valid distance, metres.
+            places: (n,) indices of the frames to observe; None = all. Others have no rows or pairs.
             only: (N,) index of the only camera used in each frame; None = all cameras.
             keep_views: keep the measurements of each camera in ``by_view``, 110 kB a frame.
+            pairs: search self-contacts, if the term is switched on.
+            depth_points_only: match neither protruding samples nor rims.
         """
-        count, size, new = len(self.frames), len(self.samples.vertex), problem.base.new_empty
-        rows = CloudRows(new(count, size), new(count, size, 3), new(count, size))
-        problem.rows, kept = None, []  # those of the last matching are not used
-        for frames in _blocks(count):
-            self.by_view = self._match_frames(problem, frames, reach, only)
-            for whole, part in zip(rows, self.rows(self.by_view.points), strict=True):
-                whole[frames] = part
-            kept += [self.by_view] if keep_views else []
-        self.by_view = _joined(kept) if keep_views else None
-        return rows
+        count, size, zeros = len(self.frames), len(self.samples.vertex), problem.base.new_zeros
+        places = np.arange(count) if places is None else places
+        pairs = pairs and bool(problem.self_weight)
+        problem.rows = problem.pairs = self.by_view = None  # those of the last call are not used
+        if not self.has_cloud and not pairs:
+            return
+        rows = CloudRows(zeros(count, size), zeros(count, size, 3), zeros(count, size))
+        views = (count, len(self.observations.rig), size)
+        kept = None
+        if keep_views:
+            place, normal = zeros(count, size, 3), zeros(count, size, 3)
+            kept = ViewDistances(zeros(views), zeros(views), place, normal)
+        contacts = [no_contacts(problem.base)] * count
+        for block in _blocks(len(places)):
+            at = places[block]
+            found = self._observe_block(
+                problem, at, reach, only, contacts if pairs else None, depth_points_only
+            )
+            for whole, part in zip(rows, self._rows(found, found.points), strict=True):
+                whole[at] = part
+            if kept is not None:
+                for whole, part in zip(kept, found, strict=True):
+                    whole[at] = part
+        if self.has_cloud:
+            problem.rows, self.by_view = rows, kept
+        ids = torch.as_tensor(self.surface.ids)
+        problem.pairs = join_frames(
+            [(ids[inner], ids[outer], normal) for inner, outer, normal in contacts]
+        )
 
-    def _match_frames(
-        self, problem: BodyProblem, frames: slice, reach: float, only: np.ndarray | None
+    def _observe_block(
+        self,
+        problem: BodyProblem,
+        at: np.ndarray,
+        reach: float,
+        only: np.ndarray | None,
+        contacts: list[Contacts] | None,
+        depth_points_only: bool,
     ) -> ViewDistances:
-        """Match the points of some frames; see :meth:`match`."""
-        count, size = frames.stop - frames.start, len(self.samples.vertex)
+        """Observe the frames ``at`` (b,); see :meth:`observe_skin`.
+
+        Returns their measurements, and writes their self-contacts to ``contacts``, if given.
+        """
+        together = 16  # bodies, limited by memory: the surface of one has 250 kB
+        size, zeros = len(self.samples.vertex), problem.base.new_zeros
         views = len(self.observations.rig)
-        base = problem.base[frames]
+        where, shift = self._place_samples(problem, at)
+        of_views, points = zeros(len(at), views, size), zeros(len(at), views, size)
+        normal = zeros(len(at), size, 3)
+        expected = problem.thickness().repeat(views)
+
+        def observe_frame(row: int, vertices: Tensor, normals: Tensor) -> None:
+            t = int(at[row])
+            cloud = self.clouds[t]
+            if contacts is not None:
+                contacts[t] = find_contacts(self._self_contact, vertices, normals)
+            if cloud is None:
+                return
+            if only is not None:
+                cloud = cloud.of_view(int(only[t]))
+            skin = PosedSkin(vertices, normals, where[row], None if shift is None else shift[row])
+            matches = self._matcher.match(
+                cloud,
+                self.observations.rig,
+                self.observations.depth_bias,
+                skin,
+                expected,
+                reach,
+                depth_points_only,
+            )
+            of_views[row], points[row] = matches.distance, matches.points
+            self.measured[t], self.cloud_residual[t] = matches.measured, matches.residual
+
+        params = self.model.parameters(problem.base[at])
+        for start in range(0, len(at), together):
+            rows = slice(start, min(start + together, len(at)))
+            vertices, normals = self.surface.posed(params.frames(rows))
+            normal[rows] = normals[:, self._matcher.sample]
+            posed = zip(range(rows.start, rows.stop), vertices, normals, strict=True)
+            self._threads.map(lambda frame: observe_frame(*frame), list(posed))
+        return ViewDistances(of_views, points, where, normal)
+
+    def _place_samples(self, problem: BodyProblem, at: np.ndarray) -> tuple[Tensor, Tensor | None]:
+        """Return the samples (b, S, 3) in the frames ``at`` (b,), metres, and their displacements
+        (b, C, S, 3) until each camera exposes; None if all time offsets are 0."""
         # velocities follow from the positions two frames before and after
-        around = slice(max(frames.start - 2, 0), min(frames.stop + 2, len(self.frames)))
-        own = slice(frames.start - around.start, frames.stop - around.start)
+        around = slice(max(int(at[0]) - 2, 0), min(int(at[-1]) + 3, len(self.frames)))
         params = self.model.parameters(problem.base[around])
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
         shift = self._shift(where, around)
-        where, shift = where[own], None if shift is None else shift[own]
-        of_views = where.new_zeros(count, views, size)
-        points = where.new_zeros(count, views, size)
-        expected = problem.thickness().repeat(views)
-        normal = where.new_zeros(count, size, 3)
-        for start, vertices, normals in self._bodies(base):
-            normal[start : start + len(normals)] = normals[:, self._matcher.sample]
-
-            def match_frame(posed: tuple[int, Tensor, Tensor]) -> None:
-                row, vertices, normals = posed
-                t = frames.start + row
-                cloud = self.clouds[t]
-                if cloud is None:
-                    return
-                if only is not None:
-                    cloud = cloud.of_view(int(only[t]))
-                skin = PosedSkin(
-                    vertices, normals, where[row], None if shift is None else shift[row]
-                )
-                matches = self._matcher.match(
-                    cloud,
-                    self.observations.rig,
-                    self.observations.depth_bias,
-                    skin,
-                    expected,
-                    reach,
-                )
-                of_views[row], points[row] = matches.distance, matches.points
-                self.measured[t], self.cloud_residual[t] = matches.measured, matches.residual
-
-            rows = range(start, start + len(normals))
-            self._threads.map(match_frame, list(zip(rows, vertices, normals, strict=True)))
-        return ViewDistances(of_views, points, where, normal)
+        own = at - around.start
+        return where[own], None if shift is None else shift[own]
 
     def rows(self, points: Tensor) -> CloudRows:
         """Return the rows of E_D of ``by_view``, averaged over cameras.
@@ -432,8 +445,11 @@ class Evidence:
         points (N, C, S): effective number of points, which weights each camera's distance. Samples
         with 0 points in all cameras have no weight.
         """
-        by_view = self.by_view
-        assert by_view is not None, "call match first"
+        assert self.by_view is not None, "observe the skin first"
+        return self._rows(self.by_view, points)
+
+    def _rows(self, by_view: ViewDistances, points: Tensor) -> CloudRows:
+        """As :meth:`rows`, of other measurements."""
         total = points.sum(1)
         mean = (by_view.distance * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
@@ -442,12 +458,6 @@ class Evidence:
         weight = share * total / (total + 2.0) / noise**2
         target = mean + (by_view.normal * by_view.where).sum(2)
         return CloudRows(target, by_view.normal, weight)
-
-
-def _joined(parts: list[ViewDistances]) -> ViewDistances:
-    """Join the frames of all parts."""
-    whole = (torch.cat(values) for values in zip(*parts, strict=True))
-    return parts[0] if len(parts) == 1 else ViewDistances(*whole)
 
 
 def _blocks(count: int) -> list[slice]:

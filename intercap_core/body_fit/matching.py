@@ -149,6 +149,7 @@ class Matcher:
         skin: PosedSkin,
         expected: Tensor,
         reach: float,
+        depth_points_only: bool = False,
     ) -> FrameMatches:
         """Match one frame; returns distances by camera and sample.
 
@@ -159,14 +160,14 @@ class Matcher:
             skin: the posed body.
             expected: (C * S,) thickness of the covering, by camera and sample, metres.
             reach: largest valid distance, metres.
+            depth_points_only: match neither protruding samples nor rims.
         """
         points = self._match_points(cloud, skin, reach)
-        parts = [
-            # by camera, since samples that several cameras see determine the errors of the cameras
-            (points._replace(sample=self._row(cloud.view, points.sample)), cloud.trust),
-            self._find_protruding(cloud, rig, depth_bias, skin),
-            self._find_on_rims(cloud, rig, skin, reach),
-        ]
+        # by camera, since samples that several cameras see determine the errors of the cameras
+        parts = [(points._replace(sample=self._row(cloud.view, points.sample)), cloud.trust)]
+        if not depth_points_only:
+            parts.append(self._find_protruding(cloud, rig, depth_bias, skin))
+            parts.append(self._find_on_rims(cloud, rig, skin, reach))
         every = Matches(*map(torch.cat, zip(*(matches for matches, _ in parts), strict=True)))
         trust = torch.cat([trust for _, trust in parts])
         distance, number = average(every, trust, expected, huber=CLOUD_HUBER_M)

@@ -168,7 +168,7 @@ class Fitter:
             evidence.refine_sigma(problem)
         problem.fit_shared = True  # stage 3
         for reach in _CLOUD_REACH_M[:2] if evidence.has_cloud else ():
-            problem.rows = evidence.match(problem, reach, keep_views=False)
+            evidence.observe_skin(problem, reach, keep_views=False, pairs=False)
             evidence.observe_keypoints(problem)
             self._minimise(problem, 3)
             evidence.refine_sigma(problem)
@@ -182,9 +182,7 @@ class Fitter:
         # of the detector's wrist, which is fixed in the frame of the forearm.
         problem.columns = columns_of(self.model, hands=hands, face=face, betas=not self.one_shape)
         for _ in range(2):
-            if evidence.has_cloud:
-                problem.rows = evidence.match(problem, _CLOUD_REACH_M[-1], keep_views=False)
-            problem.pairs = evidence.find_pairs(problem)
+            evidence.observe_skin(problem, _CLOUD_REACH_M[-1], keep_views=False)
             evidence.refine_sigma(problem)
             evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4)
@@ -207,22 +205,29 @@ class Fitter:
             u=settled.covering.to(base),
         )
 
-    def observe(self, problem: BodyProblem) -> None:
-        """Update correspondences, contacts, the pose prior and sigmas at the problem's bodies."""
-        if self.evidence.has_cloud:
-            problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1])
-        problem.pairs = self.evidence.find_pairs(problem)
+    def observe(self, problem: BodyProblem, places: np.ndarray | None = None) -> None:
+        """Update correspondences, contacts, the pose prior and sigmas at the problem's bodies.
+
+        places (n,): indices of the frames whose correspondences and contacts are used; None = all.
+        """
+        self.evidence.observe_skin(problem, _CLOUD_REACH_M[-1], places=places)
         self._linearise_pose_prior(problem)
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
-    def observe_only(self, problem: BodyProblem, view: np.ndarray) -> None:
-        """Update correspondences and body keypoints only, with the points of one camera per frame.
+    def observe_only(self, problem: BodyProblem, view: np.ndarray | None = None) -> None:
+        """Update correspondences and body keypoints only.
 
-        view (N,): index of the camera whose depth points and mask rims are used. Keypoints are
-        those of all cameras.
+        view (N,): index of the camera whose measurements are used in each frame; None = the depth
+        points of all cameras. Keypoints are those of all cameras.
         """
-        if self.evidence.has_cloud:
-            problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1], view)
+        self.evidence.observe_skin(
+            problem,
+            _CLOUD_REACH_M[-1],
+            only=view,
+            keep_views=view is not None,
+            pairs=False,
+            depth_points_only=view is None,
+        )
         self.evidence.observe_keypoints(problem)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:

@@ -175,6 +175,12 @@ Contacts = tuple[Tensor, Tensor, Tensor]
 """Vertices p (M,) of penetrating samples, vertices q (M,) of surfaces, and normals (M, 3) at q."""
 
 
+def no_contacts(like: Tensor) -> Contacts:
+    """Return the contacts of a body that has none; normals have the floating type of ``like``."""
+    none = torch.zeros(0, dtype=torch.long)
+    return none, none, like.new_zeros(0, 3)
+
+
 def join_frames(contacts: list[Contacts]) -> Pairs | None:
     """Join the contacts of all frames, one element for each frame; None if there are none."""
     counts = torch.tensor([len(inner) for inner, _, _ in contacts])

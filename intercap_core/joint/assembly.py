@@ -45,10 +45,10 @@ class Assembly:
         One of the frames with the same errors represents them.
         """
         every = round(1 / self.share)
-        self.body.refresh(state)
+        self.body.refresh(state, every)
         # the body weighs a twentieth (tuned): errors of keypoints and clothing depend on the view
         # and the pose, and so resemble errors of a camera
-        yield self.body.camera_evidence(state, 0.05 * self.share, every)
+        yield self.body.camera_evidence(state, 0.05 * self.share)
         if isinstance(self.object_, ObjectImagesData):
             self.object_.refresh(state, every)
             yield self.object_.camera_evidence(state)

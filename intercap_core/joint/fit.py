@@ -168,7 +168,7 @@ def _fit_window(
         rounds.stalled.sum(),
     )
     faults = FrameFaults.of(inputs, state, stalled, assembly.contradicted())
-    assembly.body.refresh(state)
+    assembly.body.compare(state)
     return _WindowFit(
         state=state,
         contact=rounds.estimate,

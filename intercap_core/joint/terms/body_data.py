@@ -67,6 +67,7 @@ class BodyData(JointTerm):
         self._fitter, self._problem = fitter, problem
         self._trusted = trusted[fitter.frames]
         self._interpolated: np.ndarray | None = None  # bodies at the first refresh
+        self._every = 1  # trusted frames that an observed one stands for
 
     @classmethod
     def load(
@@ -100,21 +101,28 @@ class BodyData(JointTerm):
         problem.hand_share = 1 / max(lasting, 1.0)
         return cls(fitter, problem, ~failed)
 
-    def refresh(self, state: State) -> None:
-        """Find correspondences and visibility at ``state``."""
+    def refresh(self, state: State, every: int = 1) -> None:
+        """Find correspondences and visibility at ``state``.
+
+        ``every`` observes every n-th trusted frame only, for a correction of the cameras.
+        """
         self._place(state)
-        self._fitter.observe(self._problem)
+        self._every, places = every, np.flatnonzero(self._trusted)[::every]
+        self._fitter.observe(self._problem, None if every == 1 else places)
         if self._interpolated is None:
             self._interpolated = state.body.copy()
 
-    def compare(self, state: State, camera: np.ndarray) -> None:
-        """Compare ``state`` with one view per frame, for the errors in views that were held out.
+    def compare(self, state: State, camera: np.ndarray | None = None) -> None:
+        """Compare ``state`` with the images, without equations.
 
-        Afterwards :meth:`residuals` and :meth:`person_by_view` refer to ``state`` and to ``camera``
-        (T,), the index of each frame's view. Call :meth:`refresh` before further equations.
+        Afterwards :meth:`residuals` refers to ``state``. With ``camera`` (T,), the index of one
+        view for each frame, only this view is compared, and :meth:`person_by_view` refers to it.
+        Call :meth:`refresh` before further equations.
         """
         self._place(state)
-        self._fitter.observe_only(self._problem, camera[self._fitter.frames])
+        self._fitter.observe_only(
+            self._problem, None if camera is None else camera[self._fitter.frames]
+        )
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
@@ -179,17 +187,16 @@ class BodyData(JointTerm):
         """Use these cameras from the next :meth:`refresh` on."""
         self._fitter.evidence.take_cameras(cameras.rig, cameras.depth_bias)
 
-    def camera_evidence(self, state: State, share: float, every: int = 1) -> CameraEvidence:
-        """Gauss-Newton form of E_B by body and cameras.
+    def camera_evidence(self, state: State, share: float) -> CameraEvidence:
+        """Gauss-Newton form of E_B by body and cameras, of the frames of the last :meth:`refresh`.
 
         Args:
             state: body of all frames.
             share: weight of a frame.
-            every: use every n-th trusted frame in place of n frames.
         """
         self._place(state)
         count = FREEDOMS * self.num_cameras
-        places = np.flatnonzero(self._trusted)[::every]
+        places = np.flatnonzero(self._trusted)[:: self._every]
         hessian, gradient, _ = self._linearise(state, places)
         seen = CameraEvidence(
             BODY,
@@ -199,7 +206,7 @@ class BodyData(JointTerm):
             np.zeros((len(places), BODY.stop, count)),
             np.zeros((count, count)),
             np.zeros(count),
-            every * share,
+            self._every * share,
         )
         add_by_cameras(self._fitter.evidence, self._problem, places, seen)
         return seen
