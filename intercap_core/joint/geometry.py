@@ -93,10 +93,10 @@ class PosedGeometry:
         """Skin samples (T, N, 3)."""
         return self.posed(self._geometry.skin.vertices)
 
-    def posed(self, vertices: np.ndarray) -> np.ndarray:
-        """Positions (T, K, 3) of the body's vertices with these ids (K,)."""
+    def posed(self, vertices: np.ndarray, frames: slice = slice(None)) -> np.ndarray:
+        """Positions (F, K, 3) of the body's vertices with these ids (K,) in F frames."""
         with torch.no_grad():
-            body = self._geometry.model(self._parameters, vertex_ids=vertices)
+            body = self._geometry.model(self._parameters.frames(frames), vertex_ids=vertices)
         return body.vertices.double().numpy()
 
     def object_depth(self, threads: ThreadPool) -> np.ndarray:

@@ -18,15 +18,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import sample_surface, vertex_normals
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.proximity import ON_SURFACE, along_by_object
 from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
-from intercap_core.joint.state import ALL, State
+from intercap_core.joint.state import ALL, State, frame_chunks
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
 # Standard deviation of a depth beyond the tolerance, metres. Tuned on the studio: without both
@@ -124,6 +124,12 @@ class _DeepestPoints:
         )
 
 
+def _in_box(points: np.ndarray, others: np.ndarray, margin: float) -> np.ndarray:
+    """Mask (N,) of points (N, 3) in the box around ``others`` (M, 3), widened by ``margin``."""
+    low, high = others.min(axis=0) - margin, others.max(axis=0) + margin
+    return np.asarray(((points > low) & (points < high)).all(axis=1))
+
+
 class ObjectInBody(JointTerm):
     """Depth of the object's surface inside the hands, at the vertices of the skin nearest to it.
 
@@ -154,61 +160,54 @@ class ObjectInBody(JointTerm):
         # 10 cm^2 are one measurement (tuned on the studio): a hand's breadth of a handle
         self._scale = weight / PENETRATION_SIGMA**2 * area / count / 1e-3
         model = geometry.model
-        self._faces = model.faces.numpy().astype(np.int64)
-        template = model.template.double().numpy()
-        carrier = model.skinning_weights.argmax(1).numpy()
-        self._hands = np.isin(carrier, _HANDS)[geometry.skin.vertices]
-        self._sample_of = cKDTree(template[geometry.skin.vertices]).query(template)[1]
+        hand = np.isin(model.skinning_weights.argmax(1).numpy(), _HANDS)
+        self._hands = hand[geometry.skin.vertices]
+        self._skin = np.flatnonzero(hand)  # (V,) vertex ids
+        faces = model.faces.numpy()
+        self._faces = np.searchsorted(self._skin, faces[hand[faces].all(axis=1)])
+        self._tree = SurfaceTree(model.template.numpy()[self._skin], self._faces)
         self._deepest = _DeepestPoints.none(0)
 
     def refresh(self, state: State) -> None:
         """Search the object's points inside the hands."""
-        posed, frames = self.geometry.at(state), len(state)
+        posed = self.geometry.at(state)
         near = self._hands & (np.abs(posed.proximity.distance) < NEAR_SKIN)  # (T, N)
-        # the mesh's vertices whose nearest sample is near in some frame, and their rows in ``skin``
-        ids = np.flatnonzero(near.any(axis=0)[self._sample_of])
-        skin = posed.posed(ids) if len(ids) else np.zeros((frames, 0, 3))
-        place = np.full(len(self._sample_of), -1)
-        place[ids] = np.arange(len(ids))
-        by_frame = []
-        for t in range(frames):
-            # faces with three near corners, by rows of ``skin``
-            faces = place[self._faces[near[t][self._sample_of[self._faces]].all(axis=1)]]
-            by_frame.append(
-                self._search_frame(t, state, skin[t], ids, faces, posed.skin[t, near[t]])
-            )
-        vertex = np.unique(np.concatenate([frame.vertex for frame in by_frame]))
-        deepest = _DeepestPoints.none(frames, vertex=vertex)
-        for t, frame in enumerate(by_frame):
-            at = np.searchsorted(vertex, frame.vertex)
-            deepest.local[t, at], deepest.normal[t, at] = frame.local, frame.normal
-            deepest.offset[t, at], deepest.share[t, at] = frame.offset, frame.share
+        by_frame = {}
+        for at in frame_chunks(len(state)):
+            touching = np.flatnonzero(near[at].any(axis=1)).tolist()
+            if not touching:
+                continue
+            skin = posed.posed(self._skin, at)
+            for row in touching:
+                t = at.start + row
+                by_frame[t] = self._search_frame(t, state, skin[row], posed.skin[t, near[t]])
+        vertex = np.unique(np.concatenate([[], *(frame.vertex for frame in by_frame.values())]))
+        deepest = _DeepestPoints.none(len(state), vertex=vertex.astype(int))
+        for t, frame in by_frame.items():
+            own = np.searchsorted(vertex, frame.vertex)
+            deepest.local[t, own], deepest.normal[t, own] = frame.local, frame.normal
+            deepest.offset[t, own], deepest.share[t, own] = frame.offset, frame.share
         self._deepest = deepest
 
     def _search_frame(
-        self,
-        t: int,
-        state: State,
-        skin: np.ndarray,
-        ids: np.ndarray,
-        faces: np.ndarray,
-        around: np.ndarray,
+        self, t: int, state: State, skin: np.ndarray, around: np.ndarray
     ) -> _DeepestPoints:
         """Search frame ``t``.
 
         Args:
-            skin: (V, 3) posed vertices ``ids`` (V,) of the body; ``faces`` (F, 3) index them.
+            skin: (V, 3) posed vertices of the hands.
             around: (N, 3) samples of the skin near the object.
         """
         rotation, translation = state.rotation[t], state.translation[t]
         points = self._points @ rotation.T + translation
-        if not len(faces):
-            return _DeepestPoints.none()
-        low, high = around.min(axis=0) - NEAR_SKIN / 2, around.max(axis=0) + NEAR_SKIN / 2
-        some = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+        some = np.flatnonzero(_in_box(points, around, NEAR_SKIN / 2))
+        reach = max(DEEPEST_IN_BODY, WATCHED_OUTSIDE)
+        some = some[self._tree.shaped(skin).distance(points[some], reach) < reach]
         if not len(some):
             return _DeepestPoints.none()
-        used, faces = np.unique(faces, return_inverse=True)
+        # faces that are nearest to a point, and their neighbours, which determine normals
+        around = _in_box(skin, points[some], 2 * reach)
+        used, faces = np.unique(self._faces[around[self._faces].any(axis=1)], return_inverse=True)
         embedded = find_embedded(points[some], skin[used], faces.reshape(-1, 3))
         # the deepest point at each vertex, and the number of points inside there
         order = np.argsort(embedded.distance, kind="stable")
@@ -222,7 +221,7 @@ class ObjectInBody(JointTerm):
         own = self.geometry.field.signed_distance((at - translation) @ rotation)
         kept = own > -PENETRATION_TOLERANCE
         return _DeepestPoints(
-            ids[used[vertex]][kept],
+            self._skin[used[vertex]][kept],
             self._points[point][kept],
             normal[kept],
             (embedded.distance[deepest] - along)[kept],
