@@ -128,7 +128,7 @@ STAGES: dict[str, Stage] = {
             name="scene",
             purpose="Refined extrinsics, ground plane and background.",
             reads=("frames", "detections"),
-            resources=JobResources(480, mb_per_image=0.035, seconds_per_image=0.03),
+            resources=JobResources(480, mb_per_image=0.025, seconds_per_image=0.03),
             output_bytes=2_000_000,
         ),
         Stage(
@@ -188,7 +188,10 @@ STAGES: dict[str, Stage] = {
             purpose="The sequence's page of the site.",
             reads=_ALL,
             columns=("intent",),
-            resources=JobResources(680, mb_per_image=0.3, seconds=20, seconds_per_image=0.03),
+            resources=JobResources(
+                680, mb_per_image=0.02, window=512, mb_per_window_image=0.3,
+                seconds=20, seconds_per_image=0.03,
+            ),
             output_bytes=15_000_000,
             folder_marker="index.html",
         ),

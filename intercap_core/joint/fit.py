@@ -115,6 +115,7 @@ def _correct_cameras(
             for form in assembly.camera_evidence(state.window(at)):
                 yield replace(form, frames=form.frames + at.start)
             del assembly, form  # before the next window is opened
+            return_freed_memory()
 
     correction = cameras.solve(evidence(), len(state))
     if cameras.take(correction):
