@@ -39,7 +39,6 @@ from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.body_fit.term_inputs import Targets
 from intercap_core.config import BodyFitSettings
 from intercap_core.geometry.solve.levenberg_marquardt import Solution, minimise
-from intercap_core.memory import return_freed_memory
 from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -294,7 +293,6 @@ class Fitter:
     def _minimise(self, problem: BodyProblem, trials: int) -> Solution:
         """Minimise by at most ``trials`` steps, and set the problem's parameters to the result."""
         self._linearise_pose_prior(problem)
-        return_freed_memory()  # searches leave gaps of up to 0.15 MB a frame
         shared = problem.shared_start()
         solution = minimise(
             problem,
