@@ -20,7 +20,7 @@ app = typer.Typer()
 
 
 Part = Literal[
-    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector", "rig"
+    "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector", "rig", "scan"
 ]  # fmt: skip
 
 
@@ -58,12 +58,16 @@ def evaluate(
         list[Path] | None,
         _evaluated("the detections", "Projects whose camera poses are withheld and found,"),
     ] = None,
+    scan: Annotated[
+        list[Path] | None,
+        _evaluated("the body fit", "Projects in which objects are turned and scanned,"),
+    ] = None,
     only: Annotated[
         Part | None,
         typer.Option(
             help="Evaluate one part only: sequences, field and detector up to the metrics, "
-            "captures and field_scenes up to the scene, objects up to the object track, bodies up "
-            "to the body fit, rig up to the detections."
+            "captures and field_scenes up to the scene, objects up to the object track, bodies and "
+            "scan up to the body fit, rig up to the detections."
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
@@ -112,6 +116,7 @@ def evaluate(
     parts = {
         "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
         "field_scenes": field_scenes, "field": field, "detector": detector, "rig": rig,
+        "scan": scan,
     }  # fmt: skip
     chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))

@@ -3,7 +3,7 @@
 - ``run``: the command; runs the workflows, measures, prints and writes the figures.
 - ``part``: the type of a part of the evaluation, and caching of measured errors.
 - ``sequences``, ``captures``, ``objects``, ``bodies``, ``field_scenes``, ``field``,
-  ``detector``, ``rig``: the eight parts.
+  ``detector``, ``rig``, ``scan``: the nine parts.
 - ``workflows``: brings the artefacts of all projects up to date, and measures the minutes of each
   part.
 - ``seeds``: the same recordings with new random seeds.

@@ -18,6 +18,7 @@ from intercap_core.commands.evaluate import (
     field_scenes,
     objects,
     rig,
+    scan,
     sequences,
 )
 from intercap_core.commands.evaluate.constants import total_constants
@@ -49,6 +50,7 @@ PARTS: dict[str, EvaluationPart[Any]] = {
         field.PART,
         detector.PART,
         rig.PART,
+        scan.PART,
     )
 }
 QUICK_SETTINGS = Path("config/evaluation/quick.yaml")
