@@ -57,13 +57,13 @@ def measure(project: Project, sequence: str) -> ScanErrors:
     path = project.results / "scans" / f"{sequence}.ply"
     path.parent.mkdir(exist_ok=True)
     try:
-        found = scan(project, entry.name, [sequence], output=path, replace=True)
+        found, *_ = scan(project, entry.name, [sequence], output=path, replace=True)
     except UserError as error:
         nothing = np.zeros(0)
         return ScanErrors(sequence, entry.name, nothing, nothing, problem=str(error))
     with artefacts.read(truth_of(project, sequence), TRUTH) as true:
         truth = Mesh(true["object_vertices"].astype(np.float64), true["object_faces"])
-    scanned = Mesh(found.mesh.vertices, found.mesh.faces)
+    scanned = Mesh(found.vertices, found.faces)
     aligned = scanned.moved(align(scanned, truth))
     in_true_frame = path.with_name(f"{sequence}_aligned.ply")
     trimesh.Trimesh(aligned.vertices, aligned.faces, process=False).export(in_true_frame)
