@@ -62,7 +62,7 @@ class Linearisation:
     """(B, 55, 3, 3) R_parent J_l: maps a change of a joint's axis-angle to its rotation vector in
     the world."""
     shape: Tensor
-    """(B, N, 3, S) derivatives by betas and expression."""
+    """(B, N, 3, S) derivatives by betas and expression; S = 0 if they are not requested."""
     correctives: Tensor | None
     """(B, N, 3, 54, 3) derivatives of the pose blend shapes by the axis-angles of the 54 joints
     below the root; None without pose blend shapes."""
@@ -193,7 +193,7 @@ def linearise(
     points: Tensor,
     posed: PosedJoints,
     axis_angle: Tensor,
-    joint_directions: Tensor,
+    joint_directions: Tensor | None,
 ) -> Linearisation:
     """Pose points and differentiate them.
 
@@ -202,7 +202,8 @@ def linearise(
         points: (B, N, 3) at rest, metres.
         posed: the posed joints.
         axis_angle: (B, 55, 3) local rotations.
-        joint_directions: (55, 3, S) derivatives of the rest joints by the shape.
+        joint_directions: (55, 3, S) derivatives of the rest joints by the shape; None to leave out
+            derivatives by the shape.
     """
     batch, count = points.shape[:2]
     both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
@@ -222,15 +223,17 @@ def linearise(
     around = posed.rotations[:, [max(parent, 0) for parent in PARENTS]]
     around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     frames = around @ turn_of_local
-    _, moved_offsets = joint_shape_derivatives(posed, joint_directions)
-    size = joint_directions.shape[-1]
-    shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(
-        batch, count, 3, size
-    )
-    for axis in range(3):  # adds matrix @ directions; three dense passes are faster than one matmul
-        shape = torch.addcmul(
-            shape, matrix[..., axis : axis + 1], selection.directions[:, None, axis]
+    shape = points.new_zeros(batch, count, 3, 0)
+    if joint_directions is not None:
+        _, moved_offsets = joint_shape_derivatives(posed, joint_directions)
+        shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(
+            batch, count, 3, -1
         )
+        # adds matrix @ directions; three dense passes are faster than one matmul
+        for axis in range(3):
+            shape = torch.addcmul(
+                shape, matrix[..., axis : axis + 1], selection.directions[:, None, axis]
+            )
 
     correctives = None
     if selection.posedirs is not None:

@@ -156,15 +156,18 @@ class BodyModel:
         *,
         vertex_ids: Tensor | np.ndarray | None = None,
         joints: bool = False,
+        by_shape: bool = True,
     ) -> Linearisation:
         """Pose points and prepare their derivatives; see `Linearisation`.
 
         The points are the vertices (all, or ``vertex_ids``), followed by the joints if ``joints``.
+        Without ``by_shape`` the derivatives by betas and expression are left out.
         """
         with torch.no_grad():
             selection = self.select(vertex_ids, joints=joints)
             points, posed, axis_angle = self._rest(selection, params)
-            return linearise(selection, points, posed, axis_angle, self._joint_directions)
+            directions = self._joint_directions if by_shape else None
+            return linearise(selection, points, posed, axis_angle, directions)
 
     def keypoints(self, output: BodyOutput) -> Tensor:
         """Return keypoints (B,135,3) from all vertices, or those of `keypoint_map.vertex_ids`."""

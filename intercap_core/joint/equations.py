@@ -31,6 +31,7 @@ class BandedEquations:
             damping by their large values would freeze an object that has to move as one over many
             frames.
         gradient: (T, n) J^T r.
+        energies_only: whether all but ``energies`` stays 0.
         energies: (T,) of each term, one half of the weighted sum of squares; the energy of a
             difference between frames is divided equally among them.
     """
@@ -45,7 +46,7 @@ class BandedEquations:
             threads: compute rows, a few frames each; None for one thread.
             energies_only: compute no derivatives; all but ``energies`` stays 0.
         """
-        self._threads, self._energies_only = threads or ThreadPool(), energies_only
+        self._threads, self.energies_only = threads or ThreadPool(), energies_only
         self.bands = np.zeros((min(3, frames), 0 if energies_only else frames, ALL.stop, ALL.stop))
         self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
@@ -100,9 +101,13 @@ class BandedEquations:
 
     def hold(self, columns: slice) -> None:
         """Give unknowns ``columns`` that no term constrains the step 0, by ones on the diagonal."""
-        if not self._energies_only:
+        if not self.energies_only:
             own = self.bands[0][:, columns, columns]
             own += np.eye(own.shape[-1])
+
+    def add_energy(self, term: str, energy: np.ndarray) -> None:
+        """Add the energy (T,) of a term."""
+        self.energies[term] = self.energies.get(term, 0.0) + energy
 
     def add_blocks(
         self,
@@ -113,8 +118,8 @@ class BandedEquations:
         energy: np.ndarray,
     ) -> None:
         """Add J^T W J (T, m, m), J^T W r (T, m) and energy (T,) over ``columns`` of each frame."""
-        self.energies[term] = self.energies.get(term, 0.0) + energy
-        if self._energies_only:
+        self.add_energy(term, energy)
+        if self.energies_only:
             return
         self.bands[0][:, columns, columns] += hessian
         self.damped[:, columns] += hessian.diagonal(axis1=1, axis2=2)
@@ -155,8 +160,8 @@ class BandedEquations:
         shared = np.zeros(frames)
         if frames > ahead:
             shared = _over_stencil(np.full(ahead + 1, 1 / (ahead + 1)), energy)
-        self.energies[term] = self.energies.get(term, 0.0) + shared
-        if frames <= ahead or self._energies_only:
+        self.add_energy(term, shared)
+        if frames <= ahead or self.energies_only:
             return
         forces = _over_stencil(stencil, weights[..., None] * residuals)
         # [d] (T - d, N): weight of the product of the Jacobians of frames t + d and t

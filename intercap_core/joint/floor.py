@@ -27,7 +27,7 @@ class FloorPlane:
 
     def heights(self, points: np.ndarray) -> np.ndarray:
         """Heights (..., N) of points (..., N, 3) above the floor, metres; negative below it."""
-        return (points - self.point) @ self.normal
+        return points @ self.normal - self.point @ self.normal
 
     def depths(self, points: np.ndarray) -> np.ndarray:
         """Return min(height, 0) (..., N) of points (..., N, 3), metres: 0 above the floor.

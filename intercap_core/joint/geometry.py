@@ -153,9 +153,9 @@ class PosedGeometry:
         """
         model = self._geometry.model
         parameters = model.parameters(self._parameters.vector()[frames])
-        lin = model.linearise(parameters, vertex_ids=ids)
+        lin = model.linearise(parameters, vertex_ids=ids, by_shape=False)
         along = torch.as_tensor(np.ascontiguousarray(axes), dtype=lin.points.dtype)
-        return lin.along(along)[..., BODY].double().numpy()
+        return lin.along(along).double().numpy()
 
     @cached_property
     def joints(self) -> np.ndarray:
@@ -171,8 +171,10 @@ class PosedGeometry:
         jacobian = np.empty((len(vector), NUM_JOINTS, 3, BODY.stop), np.float32)
         for at in frame_chunks(len(vector)):
             parameters = model.parameters(vector[at])
-            lin = model.linearise(parameters, vertex_ids=np.zeros(0, np.int64), joints=True)
-            jacobian[at] = lin.full()[..., BODY].numpy()
+            lin = model.linearise(
+                parameters, vertex_ids=np.zeros(0, np.int64), joints=True, by_shape=False
+            )
+            jacobian[at] = lin.full().numpy()
         return jacobian
 
     @cached_property

@@ -43,6 +43,12 @@ from intercap_core.sequence_inputs import SequencePaths
 _SETTLED = ("keypoint_offsets", "covering", "keypoint_sigma", "covering_noise", "keypoint_doubt")
 
 
+# A frame without a fit stays near its interpolated pose: inverse variances of 0.3 rad, 0.1 m
+# (tuned).
+_FILLED_PRECISION = np.full(BODY.stop, 0.3**-2)
+_FILLED_PRECISION[TRANSL] = 0.1**-2
+
+
 @dataclass(frozen=True)
 class BodyResiduals:
     """Distances of the body to the images; NaN without an observation."""
@@ -126,7 +132,10 @@ class BodyData(JointTerm):
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
-        equations.add_blocks(self.name, BODY, *self._equations(state))
+        if equations.energies_only:
+            equations.add_energy(self.name, self._energy(state))
+        else:
+            equations.add_blocks(self.name, BODY, *self._equations(state))
 
     def linearise_views(
         self, used: np.ndarray, state: State
@@ -150,28 +159,45 @@ class BodyData(JointTerm):
 
     def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,)."""
-        assert self._interpolated is not None, "refresh comes first"
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
         energy = np.zeros(len(state))
         trusted = np.flatnonzero(self._trusted)
         frames = self._fitter.frames[trusted]
         hessian[frames], gradient[frames], energy[frames] = self._linearise(state, trusted)
-        # a frame without a fit stays near its interpolated pose: 0.3 rad, 0.1 m (tuned)
-        filled = np.setdiff1d(np.arange(len(state)), frames)
-        precision = np.full(BODY.stop, 0.3**-2)
-        precision[TRANSL] = 0.1**-2
-        offset = state.body[filled] - self._interpolated[filled]
-        hessian[filled] = np.diag(precision)
-        gradient[filled] = precision * offset
-        energy[filled] = 0.5 * (precision * offset**2).sum(axis=1)
+        filled, offset = self._filled(state)
+        hessian[filled] = np.diag(_FILLED_PRECISION)
+        gradient[filled] = _FILLED_PRECISION * offset
+        energy[filled] = 0.5 * (_FILLED_PRECISION * offset**2).sum(axis=1)
         return hessian, gradient, energy
+
+    def _energy(self, state: State) -> np.ndarray:
+        """E_B's energy (T,)."""
+        energy, trusted = np.zeros(len(state)), np.flatnonzero(self._trusted)
+        places = torch.from_numpy(trusted)
+        pose = self._poses(state)
+        cost = self._problem.cost(pose[places], pose.new_zeros(0), places)
+        energy[self._fitter.frames[trusted]] = cost.double().numpy()
+        filled, offset = self._filled(state)
+        energy[filled] = 0.5 * (_FILLED_PRECISION * offset**2).sum(axis=1)
+        return energy
+
+    def _filled(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (N,) without a fit, and the offset (N, 168) from their interpolated poses."""
+        assert self._interpolated is not None, "refresh comes first"
+        fitted = self._fitter.frames[self._trusted]
+        filled = np.setdiff1d(np.arange(len(state)), fitted)
+        return filled, state.body[filled] - self._interpolated[filled]
+
+    def _poses(self, state: State) -> torch.Tensor:
+        """Poses and translations (N, 168) of the problem's frames."""
+        return torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
 
     def _linearise(
         self, state: State, places: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Matrix (N, 168, 168), gradient (N, 168) and energy (N,) in the frames ``places``."""
-        pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
+        pose = self._poses(state)
         shared = pose.new_zeros(0)  # no parameters are shared by all frames
         hessian = np.empty((len(places), BODY.stop, BODY.stop))
         gradient, energy = np.empty((len(places), BODY.stop)), np.empty(len(places))
