@@ -42,7 +42,7 @@ MEASURED = [
     ("object_track", 45, 3, 407), ("object_track", 45, 12, 645), ("object_track", 300, 6, 905),
     ("object_track", 1000, 6, 974),
     ("body_fit", 45, 2, 605), ("body_fit", 45, 12, 724), ("body_fit", 300, 6, 753),
-    ("body_fit", 1000, 6, 895),
+    ("body_fit", 1000, 6, 895), ("body_fit", 1200, 6, 1021),
     ("joint", 45, 2, 752), ("joint", 45, 12, 1046), ("joint", 300, 6, 1628),
     ("joint", 1200, 6, 2239),
     ("metrics", 45, 2, 797), ("metrics", 45, 12, 1186), ("metrics", 300, 6, 1978),
