@@ -463,8 +463,31 @@ class Config(Model):
     """The dataset's card and overview."""
     cluster: ClusterSettings = ClusterSettings()
     """Resources that jobs request from a cluster's scheduler."""
+    one_process: tuple[tuple[Name, ...], ...] = (
+        ("frames", "detections", "scene", "person"),
+        ("joint", "metrics", "summary"),
+    )
+    """Groups of consecutive stages that share a process and a job; [] = one job for each stage.
+    Without effect on results."""
     studio: StudioSettings | None = None
     """Virtual recordings to make; absent for real ones."""
+
+    @field_validator("one_process")
+    @classmethod
+    def _groups_consecutive_stages(
+        cls, groups: tuple[tuple[str, ...], ...]
+    ) -> tuple[tuple[str, ...], ...]:
+        order, start = list(STAGES), 0
+        for group in groups:
+            first = order.index(group[0]) if group and group[0] in order[start:] else len(order)
+            end = first + len(group)
+            if not group or tuple(order[first:end]) != group:
+                raise ValueError(
+                    f"the group {list(group)} is expected to name consecutive stages that follow "
+                    f"those of earlier groups; the order is {', '.join(order)}"
+                )
+            start = end
+        return groups
 
 
 def digest(value: BaseModel | Any) -> str:

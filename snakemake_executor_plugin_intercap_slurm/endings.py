@@ -46,26 +46,33 @@ class Ending:
 
 
 def endings(job: Any, entry: JobEntry, slurm_log: Path) -> list[Ending]:
-    """End of each stage of a failed job, in their order."""
-    found = []
+    """End of each stage of a failed job, in their order.
+
+    Of the stages that share a process, none is listed after the first that did not finish.
+    """
+    found: list[Ending] = []
     for part in members(job):
-        log = Path(str(next(iter(part.log))))
-        name = ": ".join([*part.wildcards, part.rule.name])
-        now = stamp(log)  # unchanged since the submission: the stage did not begin
-        if now is None or now == entry.logs.get(str(log)):
-            found.append(Ending(name, "waiting", _slurms_reason(slurm_log)))
-        else:
-            state, words = read_state(log)
-            if state == "finished":
-                words = ""
-            elif not words:
-                words = _slurms_reason(slurm_log)
-            elif words.startswith(ENDED):
-                words += f"; {_slurms_reason(slurm_log)}"
-            found.append(Ending(name, state, words))
+        for log in (Path(str(path)) for path in part.log):
+            found.append(_ending(": ".join([*part.wildcards, log.stem]), log, entry, slurm_log))
+            if found[-1].state != "finished":
+                break
     if all(ending.state == "finished" for ending in found):
         found[-1] = replace(found[-1], words=_slurms_reason(slurm_log))
     return found
+
+
+def _ending(name: str, log: Path, entry: JobEntry, slurm_log: Path) -> Ending:
+    now = stamp(log)  # unchanged since the submission: the stage did not begin
+    if now is None or now == entry.logs.get(str(log)):
+        return Ending(name, "waiting", _slurms_reason(slurm_log))
+    state, words = read_state(log)
+    if state == "finished":
+        words = ""
+    elif not words:
+        words = _slurms_reason(slurm_log)
+    elif words.startswith(ENDED):
+        words += f"; {_slurms_reason(slurm_log)}"
+    return Ending(name, state, words)
 
 
 def _slurms_reason(slurm_log: Path) -> str:

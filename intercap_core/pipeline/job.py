@@ -5,6 +5,7 @@ Imports no numerical library, so that the numbers of threads are set before any 
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import os
@@ -90,6 +91,44 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
+
+
+@contextmanager
+def benchmark(path: Path, *, since_start: bool = False) -> Iterator[None]:
+    """Measure the block and write a benchmark file with columns of Snakemake's: seconds ``s``,
+    CPU seconds ``cpu_time``, peak memory ``max_rss`` in MB ("NA" except on Linux).
+
+    Snakemake itself measures jobs. This function measures the stages of a job separately.
+
+    Args:
+        since_start: count the CPU time from the start of the process, and as much wall time.
+    """
+    _reset_peak()
+    start, cpu_start = time.monotonic(), 0.0 if since_start else time.process_time()
+    if since_start:
+        start -= time.process_time()
+    yield
+    values = {
+        "s": f"{time.monotonic() - start:.4f}",
+        "max_rss": _peak_mb(),
+        "cpu_time": f"{time.process_time() - cpu_start:.2f}",
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\t".join(values) + "\n" + "\t".join(values.values()) + "\n", encoding="utf-8")
+
+
+def _reset_peak() -> None:
+    """Reset the peak of this process's memory to its present size, where Linux can."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak_mb() -> str:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return f"{int(line.split()[1]) / 1024:.2f}"
+    return "NA"
 
 
 class _LogFormatter(logging.Formatter):

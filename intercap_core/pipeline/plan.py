@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -153,6 +153,29 @@ class Plan:
     def is_stale(self, sequence: str, stage: str) -> bool:
         """Whether an output exists, but was made from other inputs than it would be now."""
         return self._state(sequence, stage).status is OutputStatus.stale
+
+    def shared_jobs(
+        self, sequence: str, *, alone: Collection[str] = (), last: Collection[str] = ()
+    ) -> list[tuple[str, ...]]:
+        """Stages of each job that computes two or more of them, by the setting ``one_process``.
+
+        A job computes consecutive stages that are missing or stale, and no other.
+
+        Args:
+            alone: stages that get a job of their own.
+            last: stages after which a job ends.
+        """
+        jobs: list[list[str]] = []
+        for group in self.project.config.one_process:
+            jobs.append([])
+            for stage in group:
+                if stage in alone or self._state(sequence, stage).status is OutputStatus.done:
+                    jobs.append([])
+                    continue
+                jobs[-1].append(stage)
+                if stage in last:
+                    jobs.append([])
+        return [tuple(job) for job in jobs if len(job) > 1]
 
     def fingerprint(self, sequence: str, stage: str) -> str:
         """Fingerprint that the output would get; "" if that is not known yet."""

@@ -7,7 +7,7 @@ attempt, and Snakemake's own process is added.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,17 +80,25 @@ def memory_mb(project: Project, rule: str, extent: Extent, attempt: int = 1) -> 
 
 
 def minutes(
-    project: Project, rule: str, extent: Extent, attempt: int = 1, *, read_mb: float = 0.0
+    project: Project,
+    rules: Sequence[str],
+    extent: Extent,
+    attempt: int = 1,
+    *,
+    read_mb: float = 0.0,
 ) -> int:
     """Minutes that a job requests; proportional to the number of the attempt.
 
     Args:
-        read_mb: megabytes of recordings that the job reads.
+        rules: entries of ``JOBS`` that the job computes one after the other.
+        read_mb: megabytes of recordings that the first one reads.
     """
-    seconds = JOBS[rule].time_s(extent) + read_mb / READ_MB_PER_SECOND
-    seconds += _added(project, rule)[1] * extent.images
-    requested = LEAST_MINUTES + seconds * TIME_MARGIN / 60
-    return attempt * round(requested * _scale(project.config.cluster.time_scale, rule))
+    scales = {rule: _scale(project.config.cluster.time_scale, rule) for rule in rules}
+    seconds = scales[rules[0]] * read_mb / READ_MB_PER_SECOND
+    for rule, scale in scales.items():
+        added = _added(project, rule)[1] * extent.images
+        seconds += scale * (JOBS[rule].time_s(extent) + added)
+    return attempt * round(LEAST_MINUTES * max(scales.values()) + seconds * TIME_MARGIN / 60)
 
 
 def _added(project: Project, rule: str) -> tuple[float, float]:

@@ -15,6 +15,7 @@ import h5py
 from numba.core.caching import _CacheLocator
 
 from intercap_core.kernel_cache import use_kernel_cache
+from intercap_core.stage_list import SEQUENCE_STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
@@ -201,7 +202,7 @@ class Flow:
         )  # fmt: skip
 
     def pending(self, *, new_process: bool = False) -> set[tuple[str, str]]:
-        """(sequence, rule) of every job that a run would start; sequence "" for the dataset's.
+        """(sequence, stage) of every output that a run would make; sequence "" for the dataset's.
 
         Args:
             new_process: start Snakemake, as a user does, instead of using the running one.
@@ -213,9 +214,10 @@ class Flow:
         pending = set()
         for entry in entries:
             if entry["plan"] != "no update":
-                parts = Path(entry["output_file"]).parts
-                sequence = next((name for name in (ONE, OTHER) if name in parts), "")
-                pending.add((sequence, entry["rule"]))
+                path = Path(entry["output_file"])
+                sequence = next((name for name in (ONE, OTHER) if name in path.parts), "")
+                stage = path.stem if path.stem in SEQUENCE_STAGES else entry["rule"]
+                pending.add((sequence, stage))
         return pending
 
 

@@ -479,3 +479,33 @@ def test_files_of_equal_names_in_folders_behind_links_count(folder: Path) -> Non
         (reason,) = Plan(load_project(SETTINGS)).states(OTHER)["studio"].reasons
         assert f"{name}/map.png has another content" in reason
         _bring_up_to_date(load_project(SETTINGS))
+
+
+def test_consecutive_stages_that_are_not_done_share_a_job(folder: Path) -> None:
+    groups = [["frames", "detections", "scene", "person"], ["metrics", "summary", "page"]]
+    _set(folder, one_process=groups)
+
+    def shared(**options: set[str]) -> list[tuple[str, ...]]:
+        return Plan(load_project(SETTINGS)).shared_jobs(OTHER, **options)
+
+    project = load_project(SETTINGS)
+    assert shared() == []
+    _annotate(folder, CONTACT)  # joint and later stages
+    assert shared() == [("metrics", "summary", "page")]
+    for stage in ("detections", "person"):
+        project.artefact(OTHER, stage).unlink()
+    assert shared() == [("metrics", "summary", "page")]
+    project.artefact(OTHER, "scene").unlink()
+    assert shared() == [("detections", "scene", "person"), ("metrics", "summary", "page")]
+    assert shared(alone={"summary"}) == [("detections", "scene", "person")]
+    assert shared(last={"scene", "summary"}) == [("detections", "scene"), ("metrics", "summary")]
+
+
+@pytest.mark.parametrize(
+    "groups",
+    [[["scene", "frames"]], [["frames", "scene"]], [["page"], ["joint"]], [["walk"]], [[]]],
+)
+def test_groups_of_other_stages_are_refused(folder: Path, groups: list[list[str]]) -> None:
+    _set(folder, one_process=groups)
+    with pytest.raises(UserError, match="expected to name consecutive stages"):
+        load_project(SETTINGS)

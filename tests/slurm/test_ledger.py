@@ -100,6 +100,22 @@ def test_each_stage_of_a_group_is_reported(folder: Path) -> None:
     assert "CANCELLED" in found["walk: joint"].line("5")
 
 
+def test_each_stage_of_a_shared_job_is_reported(folder: Path) -> None:
+    job = Job(folder, stage="scene_to_person")
+    job.log = [folder / "scene.log", folder / "person.log"]
+    entry = JobEntry.of(job)
+    log(folder, "scene", "finished in 3.0 s")
+    log(folder, "person", "failed: no keypoints")
+    ends = [(found.name, found.state) for found in endings(job, entry, folder / "missing.log")]
+    assert ends == [("walk: scene", "finished"), ("walk: person", "failed")]
+    (folder / "person.log").unlink()
+    states = [found.state for found in endings(job, entry, folder / "missing.log")]
+    assert states == ["finished", "waiting"]
+    log(folder, "scene", "failed: no images")
+    (ending,) = endings(job, entry, folder / "missing.log")
+    assert ending.line("5") == "Slurm job 5, walk: scene: failed: no images"
+
+
 def test_an_unexpected_error_is_no_user_error(folder: Path) -> None:
     entry = JobEntry.of(Job(folder))
     log(folder, "joint", "failed: unexpected OSError: stale file handle")

@@ -93,3 +93,19 @@ def test_a_run_replaces_a_damaged_artefact(lab: Flow) -> None:
     assert "Traceback" not in done.stderr
     assert computed(lab, ONE) == whole
     assert not list(lab.results.rglob(".*.part")) and not list(lab.results.rglob(".*.lease"))
+
+
+def test_a_failed_stage_keeps_the_outputs_of_its_process(lab: Flow) -> None:
+    module = lab.folder / "intercap_core" / "stages" / "person.py"
+    whole = module.read_text()
+    for stage in ("detections", "scene"):
+        lab.artefact(ONE, stage).unlink()
+    try:
+        module.write_text(f"{whole}\n\ndef run(**_):\n    raise ValueError('nobody')\n")
+        done = lab.run(str(lab.artefact(ONE, "person").relative_to(lab.folder)))
+        assert done.returncode == 1
+        assert f"{ONE}: person failed: unexpected ValueError: nobody" in done.stderr
+        pending = {stage for name, stage in lab.pending(new_process=True) if name == ONE}
+    finally:
+        module.write_text(whole)
+    assert "person" in pending and not pending & {"frames", "detections", "scene"}

@@ -54,7 +54,7 @@ def test_several_targets_are_remade_after_an_edit(flow: Flow) -> None:
         done = flow.ask("--dry-run", *targets)
     assert done.returncode == 0, done.stderr[-3000:]
     jobs = re.findall(r"^(\w+) +1$", done.stdout + done.stderr, re.MULTILINE)
-    assert set(jobs) == {"joint", "metrics", "summary"}
+    assert set(jobs) == {"joint", "metrics_to_summary"}
 
 
 def test_editing_a_term_reruns_the_stages_that_reach_it(flow: Flow) -> None:

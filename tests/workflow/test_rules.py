@@ -21,7 +21,7 @@ from tests.helpers.flow import Flow
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = "\n".join(path.read_text() for path in sorted((ROOT / "workflow/rules").glob("*.smk")))
-# Text by name; the rule of all stages takes its name from the list of stages.
+# Text by name; the rule of all stages takes its name from the stages of a job.
 RULES = dict(re.findall(r"^ *rule ?(\w*):\n(.*?)(?=^\w|\Z)", TEXT, re.DOTALL | re.MULTILINE))
 
 
@@ -63,13 +63,13 @@ def test_stages_cannot_read_undeclared_columns() -> None:
 def test_rules_declare_log_resources_and_message(rule: str) -> None:
     for part in ('"""', "output:", "log:", "benchmark:", "mem_mb=", "runtime=", "message:"):
         assert part in RULES[rule], part
-    stage = f'"{rule}"' if rule else "_stage.name"
+    stage = f'"{rule}"' if rule else "*_stages"
     assert rule == "broken_annotation" or f"mark=out_of_date({stage})" in RULES[rule]
 
 
 def test_one_rule_has_the_inputs_of_all_stages() -> None:
     assert RULES.keys() == {"", "studio", "dataset", "broken_annotation"}
-    assert "unpack(inputs_of(_stage.name))" in RULES[""]
+    assert "unpack(inputs_of(*_stages))" in RULES[""]
 
 
 @pytest.mark.parametrize("arguments", [("--lint",), ("--workflow-profile", "slurm", "--dry-run")])

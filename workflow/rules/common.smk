@@ -1,5 +1,7 @@
 import functools
 import re
+import sys
+from itertools import combinations
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -89,61 +91,123 @@ def annotation_input(wildcards):
     return [rules.broken_annotation.output.checked.format(sequence=sequence)]
 
 
-def out_of_date(stage):
-    """Input function: for a stale output, a mark that is newer than the output.
+def jobs():
+    """Stages of each kind of job, and the sequences that have it: by the plan and the command line.
+
+    A job on a cluster gets the name of its rule from the main process.
+    """
+    if not workflow.is_main_process:
+        groups = [*SETTINGS.one_process, *((stage,) for stage in STAGES)]
+        return {
+            group[first:end]: SEQUENCES
+            for group in groups
+            for first, end in combinations(range(len(group) + 1), 2)
+        }
+    # Snakemake parses the workflow before it sets `workflow.dag_settings`, which has the targets
+    words = {word for argument in sys.argv[1:] for word in argument.split("=")}
+    resources = workflow.resource_settings
+    # options such as --until and --set-threads name rules
+    named = {*words, *resources.overwrite_threads, *resources.overwrite_resources}
+    alone = {
+        stage
+        for stage in STAGES
+        if stage in named or gpu_of(stage) or threads_of(stage) > 1
+    }
+    last = {
+        stage
+        for stage in STAGES
+        for name in SEQUENCES
+        if PROJECT.artefact(name, stage).as_posix() in words
+    }
+    found = {(stage,): list(SEQUENCES) for stage in STAGES}
+    for name in SEQUENCES:
+        for stages in PLAN.shared_jobs(name, alone=alone, last=last):
+            found.setdefault(stages, []).append(name)
+            for stage in stages:
+                found[(stage,)].remove(name)
+    return found
+
+
+def rule_name(stages):
+    """Name of the rule of a job: its stage, or the first and the last of several."""
+    return "_to_".join(dict.fromkeys((stages[0], stages[-1])))
+
+
+def one_of(names):
+    """Pattern that matches the names."""
+    return "|".join(map(re.escape, names)) or NOTHING
+
+
+def out_of_date(*stages):
+    """Input function: for each stale output, a mark that is newer than the output.
 
     Only this mark makes Snakemake run a job again; without it, all inputs are ``ancient``. See
     docs/reruns.md.
     """
-    return lambda wildcards: PLAN.mark(getattr(wildcards, "sequence", ""), stage)
+
+    def marks(wildcards):
+        sequence = getattr(wildcards, "sequence", "")
+        return [path for stage in stages for path in PLAN.mark(sequence, stage)]
+
+    return marks
 
 
-def identity_of(stage):
-    """Param: fingerprint that the output will get, shown in Snakemake's reports."""
-    return lambda wildcards: PLAN.fingerprint(getattr(wildcards, "sequence", ""), stage)
+def identity_of(*stages):
+    """Param: fingerprints that the outputs will get, shown in Snakemake's reports."""
+
+    def fingerprints(wildcards):
+        sequence = getattr(wildcards, "sequence", "")
+        return [PLAN.fingerprint(sequence, stage) for stage in stages]
+
+    return fingerprints
 
 
-def inputs_of(stage):
-    """Input function: the artefacts that a stage reads, by stage, and the studio's recording.
+def inputs_of(*stages):
+    """Input function: the artefacts that a job reads, by stage, and the studio's recording.
 
-    Their dates count only if the stage's output is stale. If it is not, an artefact that is made
-    again gets the same content, and the output stays up to date.
+    Their dates count only if an output of the job is stale. If none is, an artefact that is made
+    again gets the same content, and the outputs stay up to date.
     """
+    read = {name for stage in stages for name in STAGES[stage].reads} - set(stages)
     made = []
-    if "recordings" in STAGES[stage].columns:
+    if any("recordings" in STAGES[stage].columns for stage in stages):
         made.append("manifest")
-    if "truth" in stage_code(stage).parameters:
+    if any("truth" in stage_code(stage).parameters for stage in stages):
         made.append("truth")
 
     def files(wildcards):
         sequence = wildcards.sequence
         paths = {
-            name: f"{RESULTS}/{sequence}/{name}.h5" for name in STAGES[stage].reads
+            name: f"{RESULTS}/{sequence}/{name}.h5" for name in STAGES if name in read
         }
         if sequence in VIRTUAL:
             studio = {name: getattr(rules.studio.output, name) for name in made}
             paths |= {
                 name: path.format(sequence=sequence) for name, path in studio.items()
             }
-        if PLAN.is_stale(sequence, stage):
+        if any(PLAN.is_stale(sequence, stage) for stage in stages):
             return paths
         return {name: ancient(path) for name, path in paths.items()}
 
     return files
 
 
-def files_of(stage):
-    """Param: path, size and date of the user's files that a stage reads, without the studio's.
+def files_of(*stages):
+    """Param: path, size and date of the user's files that a job reads, without the studio's.
 
     The executor for Slurm does not adopt jobs whose files have changed. Files are not inputs: Snakemake
     fails the job of an input that is dated ahead of the clock and removes its output.
     """
 
     def files(wildcards):
-        made = PROJECT.recordings_made(wildcards.sequence)
+        sequence = wildcards.sequence
+        made = PROJECT.recordings_made(sequence)
+        read = [
+            path for stage in stages for path in files_read(PROJECT, sequence, stage)
+        ]
         return [
             f"{path} {stamp(path)}"
-            for path in files_read(PROJECT, wildcards.sequence, stage)
+            for path in dict.fromkeys(read)
             if made is None or not path.is_relative_to(made)
         ]
 
@@ -191,23 +255,25 @@ def length_since(sequence, changed):
     return extent_of(PROJECT, sequence)
 
 
-def memory(stage):
-    """Resource: megabytes by frames and cameras, growing with each attempt."""
+def memory(*stages):
+    """Resource: megabytes by frames and cameras, growing with each attempt; of the stage that
+    needs most."""
 
     def megabytes(wildcards, attempt):
-        return memory_mb(PROJECT, stage, length_of(wildcards), attempt)
+        extent = length_of(wildcards)
+        return max(memory_mb(PROJECT, stage, extent, attempt) for stage in stages)
 
     return megabytes
 
 
-def duration(stage):
+def duration(*stages):
     """Resource: minutes by frames and cameras, and by file size for the stage frames."""
 
     def asked(wildcards, attempt):
         read = 0.0
-        if stage == "frames":
+        if "frames" in stages:
             read = recorded_mb(PROJECT.sequences[wildcards.sequence].recordings)
-        return minutes(PROJECT, stage, length_of(wildcards), attempt, read_mb=read)
+        return minutes(PROJECT, stages, length_of(wildcards), attempt, read_mb=read)
 
     return asked
 

@@ -1,31 +1,38 @@
-for _stage in STAGES.values():
+for _stages, _sequences in jobs().items():
 
     rule:
-        """One stage of one sequence: a rule for each entry of `stage_list.STAGES`."""
+        """One stage of one sequence, or consecutive stages that share a process.
+
+        A rule for each entry of `stage_list.STAGES`, named after it, and for each group of stages
+        that the setting `one_process` joins in this run, named after the first and the last.
+        """
         name:
-            _stage.name
+            rule_name(_stages)
         input:
-            unpack(inputs_of(_stage.name)),
+            unpack(inputs_of(*_stages)),
             annotation=ancient(annotation_input),
-            mark=out_of_date(_stage.name),
+            mark=out_of_date(*_stages),
         output:
-            output_of(_stage.name),
+            [output_of(stage) for stage in _stages],
         log:
-            f"{LOGS}/{{sequence}}/{_stage.name}.log",
+            [f"{LOGS}/{{sequence}}/{stage}.log" for stage in _stages],
         benchmark:
-            f"{BENCHMARKS}/{{sequence}}/{_stage.name}.tsv"
+            f"{BENCHMARKS}/{{sequence}}/{rule_name(_stages)}.tsv"
+        wildcard_constraints:
+            sequence=one_of(_sequences),
         conda:
             ENVIRONMENT
-        threads: threads_of(_stage.name)
+        threads: max(map(threads_of, _stages))
         resources:
-            **gpu_of(_stage.name),
-            mem_mb=memory(_stage.name),
-            runtime=duration(_stage.name),
+            **gpu_of(_stages[0]),
+            mem_mb=memory(*_stages),
+            runtime=duration(*_stages),
         params:
-            identity=identity_of(_stage.name),
-            files=files_of(_stage.name),
+            stages=_stages,
+            identity=identity_of(*_stages),
+            files=files_of(*_stages),
         message:
-            f"{{wildcards.sequence}}: {_stage.name} ({_stage.purpose})"
+            f"{{wildcards.sequence}}: {', '.join(_stages)}"
         script:
             "../scripts/stage.py"
 

@@ -16,7 +16,7 @@ rule studio:
     benchmark:
         f"{BENCHMARKS}/{{sequence}}/studio.tsv"
     wildcard_constraints:
-        sequence="|".join(map(re.escape, VIRTUAL)) or NOTHING,
+        sequence=one_of(VIRTUAL),
     conda:
         ENVIRONMENT
     threads: 1

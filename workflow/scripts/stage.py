@@ -1,14 +1,33 @@
-"""One stage of one sequence; the rule's name says which."""
+"""One stage of one sequence, or several that share this process, in their order."""
 
-from intercap_core.pipeline.job import job
+import gc
+import sys
+from contextlib import nullcontext
 
-with job(
-    f"{snakemake.wildcards.sequence}: {snakemake.rule}",
-    snakemake.log[0],
-    threads=snakemake.threads,
-):
-    from intercap_core.pipeline.step import run_step
-    from intercap_core.project import load_project
+from intercap_core.pipeline.job import benchmark, job
+from intercap_core.stage_list import STAGES
 
-    project = load_project(**snakemake.config["project"])
-    run_step(snakemake.rule, project, snakemake.wildcards.sequence, keep=True)
+sequence, stages = snakemake.wildcards.sequence, snakemake.params.stages
+failed = set()
+for stage, log in zip(stages, snakemake.log, strict=True):
+    if failed & set(STAGES[stage].reads):
+        failed.add(stage)
+        continue
+    try:
+        with job(f"{sequence}: {stage}", log, threads=snakemake.threads):
+            from intercap_core.pipeline.step import run_step
+            from intercap_core.project import load_project
+
+            project = load_project(**snakemake.config["project"])
+            path = project.benchmarks / sequence / f"{stage}.tsv"
+            # Snakemake measures the job, which is the stage if it has no other
+            measured = benchmark(path, since_start=stage == stages[0])
+            with measured if len(stages) > 1 else nullcontext():
+                run_step(stage, project, sequence, keep=True)
+    except SystemExit as end:
+        if end.code != 1:  # a signal ends the process
+            raise
+        failed.add(stage)
+    gc.collect()
+if failed:
+    sys.exit(1)

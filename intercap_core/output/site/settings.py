@@ -7,10 +7,10 @@ from typing import Any
 
 from intercap_core.config import Config
 
-# places of files, and sections that other parts of the page show
+# places of files, sections that other parts of the page show, and settings of the run alone
 _LEFT_OUT = {
     "dataset", "exclude", "sequences", "subjects", "objects", "annotations", "results",
-    "body_models", "card", "studio",
+    "body_models", "card", "studio", "cluster", "one_process",
 }  # fmt: skip
 
 
