@@ -104,7 +104,7 @@ def jobs():
             for first, end in combinations(range(len(group) + 1), 2)
         }
     # Snakemake parses the workflow before it sets `workflow.dag_settings`, which has the targets
-    words = {word for argument in sys.argv[1:] for word in argument.split("=")}
+    words = {re.sub("^--[a-z-]+=", "", argument) for argument in sys.argv[1:]}
     resources = workflow.resource_settings
     # options such as --until and --set-threads name rules
     named = {*words, *resources.overwrite_threads, *resources.overwrite_resources}
