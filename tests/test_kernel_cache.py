@@ -193,6 +193,10 @@ def test_all_that_a_kernel_can_reach_counts() -> None:
         assert set(reached) <= set(found) | {neutral}
 
 
+def test_an_edit_of_settings_or_stages_recompiles_nothing() -> None:
+    assert not {"intercap_core.config", "intercap_core.stage_list"} & kernel_modules().keys()
+
+
 def test_importing_the_package_is_light(package: Path) -> None:
     done = python(package, "import sys\nimport intercap_core\nprint(*sys.modules)")
     assert done.returncode == 0, done.stderr

@@ -18,7 +18,6 @@ from intercap_core.geometry.camera.projection import MIN_DEPTH_M
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
-from intercap_core.sequence_inputs import SequencePaths
 
 
 def segmented_points(
@@ -125,7 +124,10 @@ def read_clouds(
     rig: Rig,
     depth_bias: np.ndarray,
     image_of: np.ndarray,
-    paths: SequencePaths,
+    *,
+    detections: Path,
+    person: Path,
+    object_track: Path,
 ) -> SegmentedClouds:
     """Segmented clouds of a sequence, from its detections, person and object track.
 
@@ -133,17 +135,17 @@ def read_clouds(
         images: colour and depth, ordered by the moment that they show.
         depth_bias: (C,) metres.
         image_of: (T, C) frame set whose image shows each moment; -1 = none.
-        paths: artefacts of the sequence.
+        detections, person, object_track: artefacts of the sequence.
     """
-    found = Detections.load(paths.detections).showing(image_of).with_candidates_of(paths.person)
-    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
+    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
+    with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
     total, cameras = kept.shape
     candidates = [
         [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
         for t in range(total)
     ]
-    return SegmentedClouds(images, rig, read_person_masks(paths.person), candidates, depth_bias)
+    return SegmentedClouds(images, rig, read_person_masks(person), candidates, depth_bias)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -101,7 +101,10 @@ def _measure(
         artefacts.read(paths.joint, JOINT) as fitted,
     ):
         images = recording.showing(setting["image_of"])
-        clouds = read_clouds(images, rig, fitted["depth_bias"], setting["image_of"], paths)
+        clouds = read_clouds(
+            images, rig, fitted["depth_bias"], setting["image_of"],
+            detections=paths.detections, person=paths.person, object_track=paths.object_track,
+        )  # fmt: skip
         known = None
         if truth is not None:
             vertices = body_track.model.num_vertices

@@ -27,7 +27,6 @@ from intercap_core.inputs.documents import dump_yaml
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.capture_folder import (
     SOUND_RATE,
-    Aligner,
     CameraFiles,
     CaptureFolder,
     Device,
@@ -35,6 +34,7 @@ from intercap_core.studio.capture_folder import (
     ImageFiles,
 )
 from intercap_core.studio.mkv import MkvWriter
+from intercap_core.studio.render import Aligner
 from intercap_core.studio.rig import STAGGER_S
 
 BEHAVE_DATE = "Date01"  # folder of the calibration

@@ -18,8 +18,9 @@ from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import Image
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.studio.capture_folder import Aligner, Device, DeviceFrame
+from intercap_core.studio.capture_folder import Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS, camera_names
+from intercap_core.studio.render import Aligner
 from intercap_core.studio.rig import StudioRig, build_rig
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 

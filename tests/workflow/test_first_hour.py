@@ -20,7 +20,7 @@ import pytest
 from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.studio.capture_folder import Aligner
+from intercap_core.studio.render import Aligner
 from tests.helpers.flow import ONE, ROOT, Flow, share_kernels
 from tests.helpers.release_folders import write_behave, write_intercap
 

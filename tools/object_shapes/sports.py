@@ -10,7 +10,6 @@ from object_shapes.parts import Built, Part, box, disc, plate, rod, tube, union
 
 BLACK, GREY, WHITE = (34, 34, 36), (150, 154, 160), (236, 236, 230)
 WOOD, CREAM, YELLOW, RED = (172, 120, 70), (232, 222, 190), (236, 190, 40), (190, 40, 40)
-LIME = (206, 220, 60)
 
 
 def skateboard() -> Built:

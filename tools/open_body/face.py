@@ -52,10 +52,6 @@ def _mask(source: Source, part: str) -> np.ndarray:
     return value > (image.min() + image.max()) / 2
 
 
-def lip_vertices(source: Source) -> np.ndarray:
-    return np.unique(source.faces[_mask(source, "lips")])
-
-
 def landmarks(source: Source, template: np.ndarray) -> dict[str, np.ndarray]:
     """SMPL-X's lmk_faces_idx (51), lmk_bary_coords (51,3), dynamic_lmk_* (79,17[,3])."""
     front = _Front(template, source.faces)

@@ -317,12 +317,6 @@ def keypoint_paths(folder: Path, camera: str) -> tuple[Path | None, list[Path]]:
     return whole[0] if whole else None, sorted(single[0].values()) if single else []
 
 
-def has_keypoints(folder: Path, camera: str) -> bool:
-    """Whether there is any file for the camera."""
-    whole, single = keypoint_paths(folder, camera)
-    return whole is not None or bool(single)
-
-
 def read_camera(
     folder: Path, images: CameraImages, *, full_confidence: float, layout: str | None = None
 ) -> PeopleByImage:

@@ -126,7 +126,10 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         _add_images(content, images, rig, moments)
         if {"detections", "person", "object_track"} <= existing.keys():
             objects = None if mesh is None or not known.any() else mesh
-            clouds = read_clouds(images, rig, bias, image_of, paths)
+            clouds = read_clouds(
+                images, rig, bias, image_of,
+                detections=paths.detections, person=paths.person, object_track=paths.object_track,
+            )  # fmt: skip
             _add_clouds(content, clouds, shown, objects, moments, zup)
         if truth is not None and truth.is_file():
             count = shown.model.num_vertices

@@ -14,7 +14,6 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.keypoint_files import (
     KeypointCleaner,
-    has_keypoints,
     preview_keypoints,
     read_camera,
 )
@@ -58,7 +57,6 @@ def noses(found) -> dict[int, list[float]]:
 def test_one_file_a_camera(tmp_path, name):
     write(tmp_path / name, [whole(100, image_id=0), whole(300, image_id=2), whole(5, image_id=2)])
     found = read(tmp_path)
-    assert has_keypoints(tmp_path, "k1") and not has_keypoints(tmp_path, "k2")
     assert noses(found) == {0: [100], 1: [], 2: [300, 5], 3: []} and found.notes == []
 
 
