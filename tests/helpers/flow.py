@@ -216,7 +216,8 @@ class Flow:
             if entry["plan"] != "no update":
                 path = Path(entry["output_file"])
                 sequence = next((name for name in (ONE, OTHER) if name in path.parts), "")
-                stage = path.stem if path.stem in SEQUENCE_STAGES else entry["rule"]
+                is_artefact = path.suffix == ".h5" and path.stem in SEQUENCE_STAGES
+                stage = path.stem if is_artefact else entry["rule"]
                 pending.add((sequence, stage))
         return pending
 
