@@ -129,7 +129,7 @@ def jobs():
 
 
 def rule_name(stages):
-    """Name of the rule of a job: its stage, or the first and the last of several."""
+    """Name of a job after its stage, or after the first and the last of several."""
     return "_to_".join(dict.fromkeys((stages[0], stages[-1])))
 
 
