@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
-from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
@@ -35,7 +34,6 @@ GAP_M = (
 )
 MIN_POINTS = 60  # of a part in one frame set, all cameras
 NORMAL_RADIUS_M = 0.015  # neighbourhood of a normal: three pixels of a Kinect at 2 m
-WRISTS = [KEYPOINT_NAMES.index(f"{side}_wrist") for side in ("left", "right")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +66,7 @@ class Recording:
         detections: Path,
         scene: Path,
         person: Path,
-        skin: Callable[[int], np.ndarray] | None,
+        skin: Callable[[int], np.ndarray],
         labels: Sequence[str],
     ) -> None:
         """Open the artefacts of a sequence.
@@ -77,12 +75,12 @@ class Recording:
             frames: the recording.
             detections, scene, person: artefacts of these stages.
             skin: returns vertices (V, 3) of the fitted body at a moment, master frame, metres.
-                Points on it are left out of the object. None = no body was fitted.
+                Points on it are left out of the object.
             labels: detector classes of the object; empty = all candidates but the person.
         """
         self.rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as source:
-            self.times = source["times"]
+            self._count = len(source["times"])
             self.frames = frames.showing(source["image_of"])
             self.bias = np.nan_to_num(source["depth_bias"])
             self.zup_from_master = source["zup_from_master"]
@@ -95,11 +93,10 @@ class Recording:
         self.labels = frozenset(labels)
         with artefacts.read(person, PERSON) as source:
             self._masks = artefacts.unpack_ragged(source["mask_offsets"], source["mask_rle"])
-            self.wrists = source["joints"][:, WRISTS]
-        self.skin = skin
+        self._skin = skin
 
     def __len__(self) -> int:
-        return len(self.times)
+        return self._count
 
     def person_mask(self, t: int, c: int) -> Runs | None:
         """The person's mask in the colour image; None = not known."""
@@ -116,11 +113,11 @@ class Recording:
 
     def surfaces(self, t: int) -> list[ViewSurface]:
         """Points of all cameras that candidates cover, at moment t."""
-        tree = None if self.skin is None else cKDTree(self.skin(t))
+        tree = cKDTree(self._skin(t))
         views = (self._surface(t, c, tree) for c in self.cameras)
         return [view for view in views if view is not None]
 
-    def _surface(self, t: int, c: int, skin: cKDTree | None) -> ViewSurface | None:
+    def _surface(self, t: int, c: int, skin: cKDTree) -> ViewSurface | None:
         image = self.frames.depth(t, c)
         candidates = [
             candidate.runs
@@ -151,9 +148,8 @@ class Recording:
             return None
         local *= ((local[:, 2] - self.bias[c]) / local[:, 2])[:, None]
         points = apply(camera.master_from_depth, local)
-        if skin is not None:
-            off = skin.query(points, distance_upper_bound=ON_SKIN_M)[0] > ON_SKIN_M
-            points, local, index, colour = points[off], local[off], index[off], colour[off]
+        off = skin.query(points, distance_upper_bound=ON_SKIN_M)[0] > ON_SKIN_M
+        points, index, colour = points[off], index[off], colour[off]
         if len(points) < MIN_POINTS:
             return None
         normals = _normals(points, camera.master_from_depth[:3, 3])
