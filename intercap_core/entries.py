@@ -67,6 +67,10 @@ class SequenceEntry(Model):
     annotation: Path | None = None
     """Annotation file of this sequence; default: <sequence>.yaml in the folder of annotations, if
     it exists."""
+    rig_from: SequenceName | None = None
+    """Sequence of the same, unmoved cameras. Its refined camera poses and depth biases are the
+    start and, with their covariance, the prior of the stage scene. See docs/usage.md, Reuse over a
+    day."""
 
     @model_validator(mode="after")
     def _floor_needs_up(self) -> SequenceEntry:

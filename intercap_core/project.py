@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ from intercap_core.inputs.documents import read_yaml
 from intercap_core.inputs.files import name_some, quoted
 from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
+from intercap_core.stage_list import STAGES
 from intercap_core.validation import describe, parse_entry, read_table
 
 M = TypeVar("M", bound=BaseModel)
@@ -98,6 +100,14 @@ class Project:
     def subjects_named(self) -> list[str]:
         """Sorted names of the people in the table of sequences."""
         return sorted({row.subject for row in self.sequences.values()} & set(self.subjects))
+
+    def reused_sequence(self, sequence: str, stage: str) -> str | None:
+        """Sequence whose artefact of ``stage`` this stage of ``sequence`` opens too; None = none.
+
+        The sequence may be excluded.
+        """
+        column = STAGES[stage].reuses
+        return getattr(self.sequences[sequence], column) if column else None
 
     def annotation_path(self, sequence: str) -> Path:
         """Path of the sequence's annotation file, which need not exist."""
@@ -236,6 +246,7 @@ def read_project(
                 )
         if name not in config.exclude:
             valid[name] = _absolute(row, table.parent)
+    faults += _faults_of_reuse(rows, table)
     faults += [
         f"{path}: exclude names {name!r}, which {table} does not list"
         for name in sorted(set(config.exclude) - set(rows))
@@ -315,6 +326,50 @@ def _named_files(project: Project) -> Iterator[tuple[str, Path | None, str]]:
     for field in ("segmentation_model", "keypoint_model", "segmentation_labels", "category_names"):
         file = getattr(config.detections, field)
         yield f"{settings}: detections.{field} is", file, "correct the path"
+
+
+def _faults_of_reuse(rows: Mapping[str, SequenceEntry | None], table: Path) -> Iterator[str]:
+    """Messages about rows whose columns of ``Stage.reuses`` name an unsuitable sequence."""
+    columns = [stage.reuses for stage in STAGES.values() if stage.reuses]
+    named: dict[str, set[str]] = {}
+    for name, row in rows.items():
+        for column in columns if row is not None else ():
+            other = getattr(row, column)
+            if other is None:
+                continue
+            place = f"{table}: sequence {name!r} has {column} {other!r}"
+            problem = f"which the table does not list ({name_some(sorted(rows), MAX_NAMES)})"
+            if other in rows:
+                problem = _mismatch(column, name, row, other, rows[other])
+            if problem:
+                yield f"{place}, {problem}; name another sequence or clear the cell"
+            else:
+                named.setdefault(name, set()).add(other)
+    try:
+        tuple(TopologicalSorter(named).static_order())
+    except CycleError as error:
+        cycle = " -> ".join(reversed(error.args[1]))
+        yield (
+            f"{table}: the columns {' and '.join(columns)} lead from a sequence back to itself "
+            f"({cycle}), so that none of them can be computed first; clear one of the cells"
+        )
+
+
+def _mismatch(
+    column: str, name: str, row: SequenceEntry | None, other: str, source: SequenceEntry | None
+) -> str:
+    """Reason why ``row`` cannot reuse what was estimated in the row ``source``; "" = none."""
+    if other == name:
+        return "which is the row itself"
+    if row is None or source is None or column != "rig_from":
+        return ""
+    scales = row.calibration_scale, source.calibration_scale
+    if row.calibration == source.calibration and scales[0] != scales[1]:
+        return (
+            f"but their calibration_scale differs: {scales[0]} for {name!r}, {scales[1]} for "
+            f"{other!r}"
+        )
+    return ""
 
 
 def _faults_of_files(project: Project) -> Iterator[str]:

@@ -83,6 +83,9 @@ class Stage:
     """Columns of the sequence's row that it reads; others are hidden from it."""
     layout_columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Further columns by the layout of the recording."""
+    reuses: str = ""
+    """Column that names another sequence, whose artefact of this stage it opens too; "" = none. The
+    stage's ``run`` takes the path, or None if the cell is empty, by the name of the column."""
     estimates: bool = False
     """True if it estimates poses, which the metrics compare with the truth."""
     folder_marker: str = ""
@@ -128,6 +131,7 @@ STAGES: dict[str, Stage] = {
             name="scene",
             purpose="Refined extrinsics, ground plane and background.",
             reads=("frames", "detections"),
+            reuses="rig_from",
             resources=JobResources(480, mb_per_image=0.025, seconds_per_image=0.03),
             output_bytes=2_000_000,
         ),

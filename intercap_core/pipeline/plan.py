@@ -29,8 +29,10 @@ from intercap_core.pipeline.lease import file_system_time
 from intercap_core.pipeline.provenance import DATASET_OUTPUTS, FILE, Manifest, read_manifest
 from intercap_core.pipeline.stage_inputs import (
     DATASET_READS,
+    NOT_RECORDED,
     STUDIO,
     dataset_manifest,
+    reused_artefact,
     stage_manifest,
     studio_manifest,
 )
@@ -271,7 +273,8 @@ class Plan:
                 sequence,
                 stage,
                 annotation,
-                artefacts={name: fingerprints[name] for name in declared.reads},
+                artefacts={name: fingerprints[name] for name in declared.reads}
+                | self._reused(sequence, stage),
                 checksums=checksums,
                 before=before,
             )
@@ -291,6 +294,18 @@ class Plan:
                     return
             yield stage, state
         checksums.save()
+
+    def _reused(self, sequence: str, stage: str) -> dict[str, str]:
+        """Fingerprint of the other sequence's artefact that a stage opens too, by its name."""
+        reused = reused_artefact(self.project, sequence, stage)
+        if reused is None:
+            return {}
+        name, path = reused
+        other = self.project.reused_sequence(sequence, stage)
+        if other in self.project.sequences:
+            return {name: self.states(other)[stage].fingerprint}
+        manifest = read_manifest(path)  # excluded: taken as it is
+        return {name: NOT_RECORDED if manifest is None else manifest.fingerprint}
 
     def _decide_studio(self, sequence: str, checksums: InputChecksums) -> OutputState:
         current = studio_manifest(self.project, sequence, checksums)

@@ -97,13 +97,13 @@ class Manifest:
             f"{name} {before.libraries.get(name, 'none')} → {self.libraries.get(name, 'none')}"
             for name in _changed(before.libraries, self.libraries)
         ]
-        code, read = _changed(before.code, self.code), _changed(before.artefacts, self.artefacts)
+        code = _changed(before.code, self.code)
         return [
             *_changed_values(before.given, self.given),
             *_changed_files(before.files, self.files),
             *([f"code of {', '.join(code)}"] if code else []),
             *([f"library {', '.join(libraries)}"] if libraries else []),
-            *([f"{', '.join(read)} changed"] if read else []),
+            *_changed_artefacts(before.artefacts, self.artefacts),
         ]
 
 
@@ -215,6 +215,16 @@ def _json(value: Any) -> str:
 
 def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+
+
+def _changed_artefacts(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Reasons in words for artefacts that changed, or that only one of two outputs read."""
+    changed = ", ".join(name for name in _changed(before, now) if name in before and name in now)
+    return [
+        *([f"{changed} changed"] if changed else []),
+        *(f"{name} is now read" for name in sorted(now.keys() - before.keys())),
+        *(f"{name} is no longer read" for name in sorted(before.keys() - now.keys())),
+    ]
 
 
 def _changed_values(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

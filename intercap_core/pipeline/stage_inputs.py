@@ -30,6 +30,7 @@ from intercap_core.stage_list import STAGES
 from intercap_core.studio.mediapipe import DETECTOR_SCRIPT
 
 STUDIO = "studio"
+NOT_RECORDED = "not recorded"  # in place of the fingerprint of an artefact without a manifest
 DATASET_READS = ("summary", "export")  # stages whose outputs those of all sequences are made from
 
 
@@ -86,12 +87,19 @@ def stage_manifest(
     """Manifest of the output that the stage would write now.
 
     Args:
-        artefacts: fingerprint of each artefact that the stage reads, by stage.
+        artefacts: fingerprint of each artefact that the stage reads, by stage, or by the name of
+            :func:`reused_artefact`.
         before: an earlier manifest; saves reading large files whose size has changed.
     """
     given = _given(project, sequence, stage, annotation)
     machine = {"cpu": processor()}
     return _manifest(stage, sequence, given, artefacts, checksums, before, machine)
+
+
+def reused_artefact(project: Project, sequence: str, stage: str) -> tuple[str, Path] | None:
+    """Name in manifests, and path, of the other sequence's artefact that a stage opens too."""
+    other = project.reused_sequence(sequence, stage)
+    return None if other is None else (f"{stage} of {other}", project.artefact(other, stage))
 
 
 def files_read(project: Project, sequence: str, stage: str) -> list[Path]:

@@ -60,6 +60,7 @@ def run_step(
         project.annotation(sequence, look_at_frames=stage != "frames"),
         {name: (inputs or {}).get(name, project.artefact(sequence, name)) for name in reads},
         output or project.artefact(sequence, stage),
+        stage_inputs.reused_artefact(project, sequence, stage),
     )  # fmt: skip
     return_large_arrays()
     done = False
@@ -100,10 +101,13 @@ class _Step:
     inputs: Mapping[str, Path]
     """Artefacts that the stage reads, by the stage that wrote them."""
     output: Path
+    reused: tuple[str, Path] | None
+    """Name in manifests, and path, of the other sequence's artefact that the stage opens too."""
 
     def current_manifest(self) -> Manifest:
         """Manifest of the output that the stage would write from these inputs."""
-        manifests = {name: read_manifest(path) for name, path in self.inputs.items()}
+        paths = dict([*self.inputs.items(), *([self.reused] if self.reused else [])])
+        manifests = {name: read_manifest(path) for name, path in paths.items()}
         checksums = InputChecksums(self.project.results / self.sequence / INPUTS_FILE)
         current = stage_inputs.stage_manifest(
             self.project,
@@ -111,7 +115,7 @@ class _Step:
             self.stage,
             self.annotation,
             artefacts={
-                name: "not recorded" if manifest is None else manifest.fingerprint
+                name: stage_inputs.NOT_RECORDED if manifest is None else manifest.fingerprint
                 for name, manifest in manifests.items()
             },
             checksums=checksums,
@@ -120,14 +124,18 @@ class _Step:
         return current
 
     def check_inputs(self) -> None:
-        """Raise UserError if an input is unreadable or belongs to another sequence."""
-        for name, path in self.inputs.items():
+        """Raise UserError if an input is unreadable or belongs to an unexpected sequence."""
+        checked = [(name, path, self.sequence) for name, path in self.inputs.items()]
+        other = self.project.reused_sequence(self.sequence, self.stage)
+        if self.reused is not None and other is not None:
+            checked.append((self.stage, self.reused[1], other))
+        for name, path, expected in checked:
             with artefacts.read(path, getattr(schemas, name.upper())) as source:
                 actual = source.attributes["sequence"]
-            if actual != self.sequence:
+            if actual != expected:
                 raise UserError(
-                    f"{path}: holds sequence {actual!r}, expected {self.sequence!r}; delete it and "
-                    f"re-run stage {name!r} for sequence {self.sequence!r}"
+                    f"{path}: holds sequence {actual!r}, expected {expected!r}; delete it and "
+                    f"re-run stage {name!r} for sequence {expected!r}"
                 )
 
     def make(self, manifest: Manifest, lease: Lease) -> bool:
@@ -159,6 +167,9 @@ class _Step:
     def _arguments(self) -> dict[str, Any]:
         """Arguments of the stage's ``run`` except the output."""
         given = stage_inputs.arguments(self.project, self.sequence, self.stage, self.annotation)
+        column = STAGES[self.stage].reuses
+        if column:
+            given[column] = None if self.reused is None else self.reused[1]
         if "paths" in stage_code(self.stage).parameters:
             return given | {"paths": SequencePaths(**self.inputs)}
         return given | dict(self.inputs)

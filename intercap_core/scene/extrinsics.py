@@ -28,7 +28,12 @@ from intercap_core.scene.registration import (
     RigEstimate,
     RigSolution,
 )
+from intercap_core.scene.rig_prior import RigPrior
 from intercap_core.scene.surfaces import DepthSurface
+
+# Factor on the solver's covariance, because the points of a surface share errors of lens and
+# material; tuned on the studio.
+COVARIANCE_FACTOR = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +92,7 @@ def refine(
     *,
     floor: FloorConstraint | None,
     free_poses: bool,
+    prior: RigPrior | None = None,
 ) -> Refinement:
     """Refine the poses of all cameras but the ``master``, depth biases and time offsets.
 
@@ -106,11 +112,13 @@ def refine(
         floor: constraint of a common floor; None = no floor. It is used only if some camera shares
             no surface with the others.
         free_poses: False keeps all given poses.
+        prior: of the poses, which are then those of ``rig``, and of the depth biases; None = errors
+            of a careful calibration.
     """
     starts, timing = moments.starts, moments.timing
     layers = {STATIC: [static], MOVING: moving}
+    given = prior.start(starts.offset) if prior else RigEstimate.start(rig, starts.offset)
     registration = Registration(rig, layers, master, starts.offset_sigma)
-    given = RigEstimate.start(rig, starts.offset)
     views = body_views(moments.subject, times)
     body = BodyConstraint(views, rig) if views.suffice else None
     known = timing.information, timing.vector
@@ -119,19 +127,28 @@ def refine(
     constraints: list[Constraint] = [body] if body else []
     if floor is not None and len(linked) < len(rig):
         constraints.append(floor)  # unnecessary if all overlap, which constrains more
+
+    def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
+        used = constraints
+        if some is not None:
+            used = [BodyConstraint(some, rig), *(c for c in constraints if c is not body)]
+        return registration.solve(given, used, known, free_poses=free)
+
+    free_poses, every = free_poses and len(rig) > 1, np.ones(len(rig), bool)
+    moved: list[int] = []
+    if prior:
+        if free_poses:  # without the prior, which would hide that a camera was moved
+            alone = solve(None, every)
+            if np.isfinite(alone.estimate.poses).all():
+                moved = prior.moved(alone.estimate.poses, _inflated(alone.covariance))
+                prior = prior.without(moved)
+        registration = registration.with_prior(prior.precision(COVARIANCE_FACTOR))
     unmoved = registration.solve(given, (), known, free_poses=False)
     result, ratios, covariance = unmoved, [], unmoved.covariance
     verdicts: dict[int, PoseVerdict] = {}
     refined = np.zeros(len(rig), bool)
-    if free_poses and len(rig) > 1:
-
-        def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
-            used = constraints
-            if some is not None:
-                used = [BodyConstraint(some, rig), *(c for c in constraints if c is not body)]
-            return registration.solve(given, used, known, free_poses=free)
-
-        freed = solve(None, np.ones(len(rig), bool))
+    if free_poses:
+        freed = solve(None, every)
         ratios = _ratios(registration, body, unmoved.estimate, freed.estimate)
         # one kind of data gets better by at least 2 %, and none worse by more; tuned on the studio
         finite = np.isfinite(freed.estimate.poses).all()
@@ -158,18 +175,25 @@ def refine(
     converged = result.last_step_m < 0.001
     verdict = _verdict(rig, pairs, ratios, refined, converged=converged, free=free_poses)
     on_floor = floor.cameras if floor is not None and floor in constraints else ()
+    of_cameras = _verdicts(rig, master, verdicts, verdict)
+    notes = list(_notes(rig, master, pairs, views, refined, on_floor))
+    if prior:
+        verdict += f"; the given poses are those of sequence {prior.sequence}"
+        for c in moved:
+            notes[c] += "; " if notes[c] else ""
+            notes[c] += f"it was moved after sequence {prior.sequence}, by its depth and keypoints"
     return Refinement(
         poses=result.estimate.poses,
         bias=result.estimate.bias,
-        covariance=_stated_covariance(covariance, master),
+        covariance=_stated_covariance(covariance, master, prior),
         offset=np.where(unknown, given.offset, result.estimate.offset),
         offset_sigma=sigma,
         converged=converged,
         pairs=pairs,
         verdict=verdict,
         refined=refined,
-        verdicts=_verdicts(rig, master, verdicts, verdict),
-        notes=_notes(rig, master, pairs, views, refined, on_floor),
+        verdicts=of_cameras,
+        notes=tuple(notes),
     )
 
 
@@ -181,18 +205,22 @@ def _verdicts(rig: Rig, master: int, own: dict[int, PoseVerdict], of_rig: str) -
     return tuple(words)
 
 
-def _stated_covariance(solved: np.ndarray, master: int) -> np.ndarray:
+def _inflated(solved: np.ndarray) -> np.ndarray:
+    """Covariance (C, 7, C, 7) of poses and depth bias from the solver's (C, 8, C, 8)."""
+    return COVARIANCE_FACTOR * solved[:, :OFFSET, :, :OFFSET]
+
+
+def _stated_covariance(solved: np.ndarray, master: int, prior: RigPrior | None) -> np.ndarray:
     """Covariance (C, 7, C, 7) of poses and depth bias from the solver's (C, 8, C, 8).
 
-    The solver's covariance is multiplied by three, because the points of a surface share errors of
-    lens and material; tuned on the studio. Poses that were not estimated get the variance of the
-    prior, except the master's, whose variance is 0.
+    Poses that were not estimated get the covariance of the prior, except the master's, whose
+    covariance is 0.
     """
-    stated = 3.0 * solved[:, :OFFSET, :, :OFFSET]
-    given = np.repeat([PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M], 3) ** 2
+    stated = _inflated(solved)
+    given = np.diag(np.repeat([PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M], 3) ** 2)
     for c in range(len(stated)):
         if c != master and not stated[c, :6, c, :6].any():
-            stated[c, :6, c, :6] = np.diag(given)
+            stated[c, :6, c, :6] = prior.covariance[c, :6, c, :6] if prior else given
     return stated
 
 

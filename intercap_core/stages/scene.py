@@ -33,6 +33,7 @@ from intercap_core.scene.ground import (
 )
 from intercap_core.scene.lens_exchange import LensExchange, exchange_lenses
 from intercap_core.scene.moments import Moments, describe_stated_start, find_moments
+from intercap_core.scene.rig_prior import RigPrior
 from intercap_core.scene.starts import NOT_DETERMINED, StatedStarts, describe_start
 from intercap_core.scene.subject_views import SubjectViews, triangulate_views
 from intercap_core.scene.surfaces import (
@@ -98,17 +99,20 @@ def run(
     settings: SceneSettings,
     floor: Floor | None,
     starts: Mapping[str, tuple[float, float]] | None = None,
+    rig_from: Path | None = None,
 ) -> None:
     """Write the scene artefact of one sequence.
 
     Args:
         floor: annotated floor points, master frame, metres; they replace the fit.
         starts: annotated time of the first image and its standard deviation, seconds, by camera.
+        rig_from: scene artefact of another sequence, whose poses are start and prior of this one's.
 
     Raises:
-        UserError: the recording has no image; the two artefacts are of different recordings; the
-            annotated floor points span no plane; the annotated starts leave no common time; cameras
-            and person contradict the stated up direction.
+        UserError: the recording has no image; the two artefacts are of different recordings;
+            ``rig_from`` has other cameras, or cameras at other places; the annotated floor points
+            span no plane; the annotated starts leave no common time; cameras and person contradict
+            the stated up direction.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -124,6 +128,10 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
+        prior = None
+        if rig_from is not None:
+            prior = RigPrior.read(rig_from, source.sequence, rig, source.master)
+            rig = rig.moved(prior.poses)
         stated, disagree = _stated_starts(source, starts or {}, master)
         moments = find_moments(
             people, rig, source.time_s, source.fps, source.available, master=master, stated=stated,
@@ -145,6 +153,7 @@ def run(
             source.time_s,
             floor=FloorConstraint.of(rig, surfaces, given_ground),
             free_poses=settings.refine_extrinsics,
+            prior=prior,
         )
         disagreements = find_disagreements(people, subject, image_of, rig)
         rig = rig.moved(refined.poses)

@@ -31,13 +31,15 @@ def test_stages_take_the_artefacts_that_they_declare(stage: str) -> None:
     names = set(inspect.signature(run).parameters)
     reads = set(STAGES[stage].reads)
     assert "paths" in names or names & set(SEQUENCE_STAGES) == reads
+    assert STAGES[stage].reuses in {"", *names}
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_manifests_contain_all_arguments_of_a_stage(stage: str) -> None:
     """Artefacts and output are not arguments in this sense; the device belongs to the machine."""
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
-    names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES) - {"output", "paths"}
+    names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES)
+    names -= {"output", "paths", STAGES[stage].reuses}
     for group, members in (("models", SequenceModels), ("fit_settings", FitSettings)):
         if group in names:
             names = names - {group} | {member.name for member in fields(members)}

@@ -163,7 +163,8 @@ def identity_of(*stages):
 
 
 def inputs_of(*stages):
-    """Input function: the artefacts that a job reads, by stage, and the studio's recording.
+    """Input function: the artefacts that a job reads, by stage or by the column that names another
+    sequence, and the studio's recording.
 
     Their dates count only if an output of the job is stale. If none is, an artefact that is made
     again gets the same content, and the outputs stay up to date.
@@ -180,6 +181,10 @@ def inputs_of(*stages):
         paths = {
             name: f"{RESULTS}/{sequence}/{name}.h5" for name in STAGES if name in read
         }
+        for stage in stages:
+            other = PROJECT.reused_sequence(sequence, stage)
+            if other in SEQUENCES:  # an excluded one is not computed
+                paths[STAGES[stage].reuses] = f"{RESULTS}/{other}/{stage}.h5"
         if sequence in VIRTUAL:
             studio = {name: getattr(rules.studio.output, name) for name in made}
             paths |= {
