@@ -79,6 +79,15 @@ def objects(text: str) -> Edit:
     return lambda folder: (folder / "objects.yaml").write_text(text)
 
 
+REUSE = HEADER.strip() + "\tcalibration_scale\trig_from\n"
+REUSED = "%s\ts01\tcup\trec\tcal\t%s\t%s\n"
+
+
+def reuse(*cells: tuple[str, str, str]) -> Edit:
+    """Rows of these names, calibration_scale and rig_from."""
+    return rows("".join(REUSED % own for own in cells), REUSE)
+
+
 MISTAKES: list[tuple[Edit, list[str]]] = [
     (remove("config.yaml"), ["config.yaml", "no such file"]),
     (settings("dataset: [\n"), ["config.yaml", "not valid YAML", "line"]),
@@ -112,6 +121,19 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         ["objects.yaml", "symmetry.continuous.0.axis.2", "finite"],
     ),
     (settings("dataset: x\nexclude: [three]\n"), ["exclude", "'three'"]),
+    (
+        reuse(("one", "", "lost"), ("two", "", "")),
+        ["sequences.tsv: sequence 'one' has rig_from 'lost', which the table does not list (one, "],
+    ),
+    (reuse(("one", "", "one")), ["sequence 'one' has rig_from 'one', which is the row itself; "]),
+    (
+        reuse(("one", "", "two"), ("two", "", "three"), ("three", "", "one")),
+        ["rig_from lead from a sequence back to itself", "one", "two", "three", "clear one of"],
+    ),
+    (
+        reuse(("one", "1", "two"), ("two", "2", "")),
+        ["'one' has rig_from 'two', but their calibration_scale differs: 1.0 for 'one', 2.0 for "],
+    ),
     (
         settings("dataset: x\njoint: {lemo: LEMO}\n"),
         ["config.yaml", "joint.lemo", "LEMO/runs/15217/Enc_last_model.pkl", "no such file"],

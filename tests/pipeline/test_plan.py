@@ -102,8 +102,8 @@ def _pending() -> set[tuple[str, str]]:
     return pending | (DATASET if plan.dataset.status is not OutputStatus.done else set())
 
 
-def _annotate(folder: Path, text: str) -> None:
-    path = folder / SETTINGS.parent / "annotations" / f"{OTHER}.yaml"
+def _annotate(folder: Path, text: str, sequence: str = OTHER) -> None:
+    path = folder / SETTINGS.parent / "annotations" / f"{sequence}.yaml"
     path.parent.mkdir(exist_ok=True)
     path.write_text(text)
 
@@ -172,6 +172,44 @@ def test_another_model_reruns_the_detections(folder: Path) -> None:
     assert _pending() == set()
     model.write_text("another")
     assert _pending() == expected
+
+
+def _reuse(folder: Path, rig_from: str) -> None:
+    """Let the row ``OTHER`` name a sequence in its column rig_from."""
+    path = folder / SETTINGS.parent / "sequences.tsv"
+    header, *rows = path.read_text().splitlines()
+    cells = [f"{row}\t{rig_from if row.startswith(OTHER) else ''}" for row in rows]
+    path.write_text("\n".join([f"{header}\trig_from", *cells, ""]))
+
+
+def test_another_sequence_whose_cameras_are_reused_counts(folder: Path) -> None:
+    """The manifest names the other scene, and what makes that one stale makes this one stale."""
+    _reuse(folder, "")
+    assert _pending() == set()
+    shutil.copy(ROOT / SETTINGS.parent / "sequences.tsv", SETTINGS.parent)
+    _reuse(folder, ONE)
+    expected = _of(OTHER, *AFTER_SCENE) | DATASET
+    assert _pending() == expected
+    reasons = Plan(load_project(SETTINGS)).states(OTHER)["scene"].reasons
+    assert f"scene of {ONE} is now read" in reasons
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    _annotate(folder, FLOOR, ONE)
+    assert _pending() == _of(ONE, *AFTER_SCENE) | expected
+    reasons = Plan(load_project(SETTINGS)).states(OTHER)["scene"].reasons
+    assert reasons == (f"scene of {ONE} changed",)
+
+
+def test_cameras_of_an_excluded_sequence_are_reused_as_they_are(folder: Path) -> None:
+    _reuse(folder, ONE)
+    _bring_up_to_date(load_project(SETTINGS))
+    _set(folder, exclude=[ONE])
+    assert _pending() == DATASET
+    scene = load_project(SETTINGS).artefact(ONE, "scene")
+    made_from = read_manifest(scene)
+    assert made_from is not None
+    write_manifest(scene, replace(made_from, libraries={"numpy": "0"}))
+    assert _pending() == _of(OTHER, *AFTER_SCENE) | DATASET
 
 
 def test_another_seed_makes_another_recording(folder: Path) -> None:
