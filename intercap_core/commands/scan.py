@@ -38,6 +38,8 @@ ROUNDS = 2  # of tracking and fusion; a third changes no figure (bench)
 TRACKED_VOXELS, TRACKED_FACES = 100, 1500  # along the mesh that is tracked; of it
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
+NOTED_CLOSED = 0.03  # share of the surface from which on the page should be looked at
+MAX_APART = 0.15  # largest share of the measured surface in separate parts, which noise leaves
 
 
 def scan(
@@ -86,7 +88,7 @@ def scan(
             mesh = finish(fuse(parts), parts, None)
         else:
             mesh = _scan(project, recordings, shown, name, labels, places)
-    _require_measured(mesh, name, sequences)
+    _require_whole(mesh, name, sequences)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(_ply(mesh.vertices, mesh.faces, mesh.colours))
     page = places / "scan.html"
@@ -94,6 +96,8 @@ def scan(
     page.write_text(scan_page(name, sequences, mesh), encoding="utf-8")
     add_entry(project, name, labels, mesh, path)
     lines = [f"  {key}: {value}" for key, value in mesh.figures().items()]
+    if mesh.closed_share > NOTED_CLOSED:
+        lines.append("  look at the orange parts of the page: no camera measured them")
     print_plain(standard_console(), "\n".join([f"scan of {name}", *lines]))
     return mesh, path, page
 
@@ -227,14 +231,21 @@ def _require_poses(part: Posed, name: str) -> None:
         )
 
 
-def _require_measured(mesh: ScannedMesh, name: str, sequences: Sequence[str]) -> None:
-    """Raise UserError if too much of the surface was never measured."""
+def _require_whole(mesh: ScannedMesh, name: str, sequences: Sequence[str]) -> None:
+    """Raise UserError if the scan is in pieces, or too much of its surface was never measured."""
     if mesh.closed_share > MAX_CLOSED:
         raise UserError(
             f"object {name!r}: no camera measured {mesh.closed_share:.0%} of its surface in "
             f"{', '.join(sequences)}, in which it turned by {mesh.turned_deg:.0f} degrees; at most "
             f"{MAX_CLOSED:.0%} is closed. Turn it so that every side faces the cameras, also its "
             "underside, or add a recording in which it is held in another place"
+        )
+    if mesh.apart_share > MAX_APART:
+        raise UserError(
+            f"object {name!r}: the scan of {', '.join(sequences)} is in pieces, with "
+            f"{mesh.apart_share:.0%} of the measured surface apart from the largest; its parts may "
+            "move against each other, or hands, shine or darkness hide what joins them. Record it "
+            "closed or folded, held in another place, or covered with matt spray"
         )
 
 

@@ -16,6 +16,7 @@ from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
 
 MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurements mix surfaces
 SAME_SURFACE_M = 0.015  # difference of neighbouring depths on one surface
+NEAREST_M = 0.1  # a camera nearer than this to the box is left out
 MARGIN_M = 0.02  # of the grid around the points
 FINEST_M = 0.002  # voxel; noise of the averaged surface is not finer
 FUSED_SETS = 60  # frame sets of a recording that are fused, at most twice as many
@@ -95,7 +96,7 @@ def _labelled(
         return None
     depth_from_object = camera.depth_from_master @ pose
     local = apply(depth_from_object, box)
-    if not lens.sees(local).all():
+    if local[:, 2].min() < NEAREST_M:
         return None
     kind = np.where(depth > 0, OTHER, UNKNOWN).astype(np.uint8)
     weight = np.ones(depth.shape, np.float32)

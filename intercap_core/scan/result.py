@@ -37,6 +37,8 @@ class ScannedMesh:
     """Largest rotation between two frame sets."""
     sets: int
     """Frame sets that were fused."""
+    apart_share: float = 0.0
+    """Share of the measured surface in separate parts, which are left out."""
 
     @property
     def watertight(self) -> bool:
@@ -99,5 +101,6 @@ def finish(surface: ClosedSurface, parts: Sequence[Posed], up: np.ndarray | None
     symmetry = propose_symmetry(vertices, faces)
     sets = sum(map(len, rotations))
     return ScannedMesh(
-        vertices, faces, measured, colours, symmetry, float(np.degrees(turned)), sets
-    )
+        vertices, faces, measured, colours, symmetry, float(np.degrees(turned)), sets,
+        surface.apart_share,
+    )  # fmt: skip

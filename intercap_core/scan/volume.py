@@ -14,6 +14,7 @@ import igl
 import numba
 import numpy as np
 import open3d as o3d
+import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from intercap_core.scan.surfaces import OBJECT, UNKNOWN
@@ -54,6 +55,8 @@ class ClosedSurface:
     """(F, 3), normals outward."""
     measured: np.ndarray
     """(V,) bool: depth images measured the vertex; the others close holes."""
+    apart_share: float
+    """Share of the measured area that lay in other parts, which are left out."""
 
 
 class Volume:
@@ -103,13 +106,17 @@ class Volume:
         mesh = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
         )
-        labels, counts, _ = mesh.cluster_connected_triangles()
-        mesh.remove_triangles_by_mask(np.asarray(labels) != int(np.argmax(counts)))
-        mesh.remove_unreferenced_vertices()
-        vertices = np.asarray(mesh.vertices)
         measured = map_coordinates(near.astype(np.float32), vertices.T, order=1) > 0.25
+        part = np.asarray(mesh.cluster_connected_triangles()[0])
+        areas = trimesh.triangles.area(vertices[faces]) * measured[faces].all(1)
+        by_part = np.bincount(part, areas)
+        largest = int(np.argmax(by_part))
+        kept, number = np.unique(faces[part == largest], return_inverse=True)
         return ClosedSurface(
-            self.low + self.voxel_m * vertices, np.asarray(mesh.triangles).copy(), measured
+            self.low + self.voxel_m * vertices[kept],
+            number.reshape(-1, 3),
+            measured[kept],
+            float(1 - by_part[largest] / max(by_part.sum(), 1e-9)),
         )
 
 
