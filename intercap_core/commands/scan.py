@@ -26,7 +26,7 @@ from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
 from intercap_core.scan.alignment import track_from
 from intercap_core.scan.fusion import Posed, fuse
-from intercap_core.scan.handled import Chain, cloud_of, find_handled, is_still
+from intercap_core.scan.handled import Chain, cloud_of, find_handled, is_still, slowest
 from intercap_core.scan.result import ScannedMesh, finish, simplified
 from intercap_core.scan.surfaces import Recording
 from intercap_core.scan.volume import ClosedSurface
@@ -156,9 +156,13 @@ def _scan(
     labels: Sequence[str],
     places: Path,
 ) -> ScannedMesh:
-    """Track and fuse the object in turns, beginning with the frame set that shows most of it."""
+    """Track and fuse the object in turns.
+
+    The first mesh is of the frame sets around one in which the object hardly moves and of which
+    many points are seen.
+    """
     clouds = {t: cloud_of(views) for t, views in shown[0].items()}
-    seed = max(clouds, key=lambda t: len(clouds[t].points))
+    seed = max(slowest(shown[0]), key=lambda t: len(clouds[t].points))
     extent = float(np.ptp(clouds[seed].points, axis=0).max())
     poses: Mapping[int, np.ndarray] = track_from(clouds, seed, max(0.004, extent / 100))
     up = recordings[0].zup_from_master[2, :3]  # the object's frame has the master's axes

@@ -72,6 +72,14 @@ def is_still(chain: Chain) -> bool:
     return _way(chain) < MOVED_M
 
 
+def slowest(chain: Chain) -> list[int]:
+    """The third of the frame sets in which the object's middle moves least."""
+    sets = sorted(chain)
+    middles = np.array([_middle(chain[t]) for t in sets])
+    speed = np.linalg.norm(np.gradient(middles, axis=0), axis=1) if len(sets) > 1 else np.zeros(1)
+    return [sets[i] for i in np.argsort(speed, kind="stable")[: -(-len(sets) // 3)]]
+
+
 def cloud_of(views: Sequence[ViewSurface]) -> Cloud:
     """The points of all cameras."""
     return Cloud(

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from intercap_core.errors import UserError
-from intercap_core.scan.handled import find_handled, is_still
+from intercap_core.scan.handled import find_handled, is_still, slowest
 from tests.scan.turned_object import Turned, turning
 
 BALL = trimesh.creation.icosphere(radius=0.05)
@@ -27,6 +27,12 @@ def test_the_object_that_moves_is_found_next_to_one_that_stands() -> None:
     assert sorted(found) == list(range(8)) and not is_still(found)
     middle = np.concatenate([view.points for view in found[7]]).mean(0)
     np.testing.assert_allclose(middle, MOVING[7], atol=0.02)
+
+
+def test_the_slowest_frame_sets_are_those_at_rest() -> None:
+    path = np.concatenate([np.zeros((4, 3)), np.linspace([0, 0, 0], [0, 0.4, 0], 4)])
+    found = find_handled(recording(path), "ball")
+    assert set(slowest(found)) <= {0, 1, 2, 3}
 
 
 def test_a_single_object_may_stand_still() -> None:
