@@ -38,8 +38,9 @@ ROUNDS = 2  # of tracking and fusion; a third changes no figure (bench)
 TRACKED_VOXELS, TRACKED_FACES = 100, 1500  # along the mesh that is tracked; of it
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
+MIN_EXPLAINED = 0.9  # least share of the object's points on the mesh
 NOTED_CLOSED = 0.03  # share of the surface from which on the page should be looked at
-MAX_APART = 0.15  # largest share of the measured surface in separate parts, which noise leaves
+MAX_APART = 0.10  # largest share of the measured surface in separate parts, which noise leaves
 
 
 def scan(
@@ -243,6 +244,13 @@ def _require_whole(mesh: ScannedMesh, name: str, sequences: Sequence[str]) -> No
             f"{', '.join(sequences)}, in which it turned by {mesh.turned_deg:.0f} degrees; at most "
             f"{MAX_CLOSED:.0%} is closed. Turn it so that every side faces the cameras, also its "
             "underside, or add a recording in which it is held in another place"
+        )
+    if mesh.explained_share < MIN_EXPLAINED:
+        raise UserError(
+            f"object {name!r}: only {mesh.explained_share:.0%} of the points that show it in "
+            f"{', '.join(sequences)} are on the mesh, expected {MIN_EXPLAINED:.0%}: its poses are "
+            "wrong in a part of the frames. Turn it more slowly, hold it with few fingers, and let "
+            "it stand alone for a second"
         )
     if mesh.apart_share > MAX_APART:
         raise UserError(

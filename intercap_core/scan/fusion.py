@@ -65,6 +65,7 @@ def fuse(
     box = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     for part in parts:
         for t in part.sets[:: max(1, len(part.sets) // FUSED_SETS)]:
+            volume.sets += 1
             views = {view.camera: view for view in part.surfaces[t]}
             for c in part.recording.cameras:
                 image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)

@@ -12,10 +12,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.scan.fusion import Posed, vertex_colours
 from intercap_core.scan.proposal import ProposedSymmetry, propose_symmetry, standing_frame
 from intercap_core.scan.volume import ClosedSurface
 
+EXPLAINED_M = 0.015  # distance of a point that shows the mesh: noise of depth and of the poses
 MESH_FACES = 20_000  # of the finished mesh; edges of 2 mm on a cup
 
 
@@ -37,6 +39,8 @@ class ScannedMesh:
     """Largest rotation between two frame sets."""
     sets: int
     """Frame sets that were fused."""
+    explained_share: float = 1.0
+    """Share of the recordings' points of the object that are near the mesh."""
     apart_share: float = 0.0
     """Share of the measured surface in separate parts, which are left out."""
 
@@ -63,6 +67,7 @@ class ScannedMesh:
             "symmetry of the shape": self.symmetry.words,
             "turned by": f"{self.turned_deg:.0f} degrees",
             "frame sets": str(self.sets),
+            "points explained": f"{self.explained_share:.0%} within {1e3 * EXPLAINED_M:.0f} mm",
         }
 
 
@@ -100,7 +105,10 @@ def finish(surface: ClosedSurface, parts: Sequence[Posed], up: np.ndarray | None
     )
     symmetry = propose_symmetry(vertices, faces)
     sets = sum(map(len, rotations))
+    points = np.concatenate([part.points(t)[::10] for part in parts for t in part.sets])
+    field = DistanceField(surface.vertices, surface.faces)
+    explained = float((field.distance(points) < EXPLAINED_M).mean())
     return ScannedMesh(
         vertices, faces, measured, colours, symmetry, float(np.degrees(turned)), sets,
-        surface.apart_share,
+        explained, surface.apart_share,
     )  # fmt: skip

@@ -67,6 +67,7 @@ class Volume:
         self.voxel_m = voxel_m
         self.low = np.asarray(low, float)
         self.size = tuple((np.ceil((high - low) / voxel_m).astype(int) + 1).tolist())
+        self.sets = 0  # frame sets that were integrated
         self._distance = np.zeros(self.size, np.float32)  # sum of weight * distance
         self._total = np.zeros(self.size, np.float32)  # sum of weight
         self._near = np.zeros(self.size, np.float32)  # votes near a surface
@@ -89,7 +90,7 @@ class Volume:
     def surface(self) -> ClosedSurface:
         """Closed surface of the largest part."""
         near = (self._near > 0) & (self._empty <= EMPTY_RATIO * self._near)
-        empty = (self._empty >= MIN_EMPTY) & ~near
+        empty = (self._empty >= min(MIN_EMPTY, self.sets)) & ~near
         value = np.where(near, self._distance / np.maximum(self._total, 1e-9), -BAND_M)
         value[empty] = BAND_M
         for axis in range(3):  # outside the grid is empty
