@@ -34,7 +34,7 @@ from intercap_core.schemas import BODY_FIT, OBJECT_TRACK
 from intercap_core.stages import object_track
 
 READ = ("frames", "detections", "scene", "person")
-ROUNDS = 2  # of tracking and fusion; a third changes no figure (bench)
+ROUNDS = 2  # of tracking and fusion; the second one tracks with a mesh of all frame sets
 TRACKED_VOXELS, TRACKED_FACES = 100, 1500  # along the mesh that is tracked; of it
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured

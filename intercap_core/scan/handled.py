@@ -12,7 +12,7 @@ from intercap_core.scan.surfaces import Recording, ViewSurface, connected_parts
 
 MAX_SETS = 150  # frame sets of a recording that are used, evenly spaced
 # Least distance between places of an object that was moved, metres. Middles of objects at rest move
-# by 3 cm when a person hides a part of them (bench).
+# by 3 cm when a person hides a part of them (studio).
 MOVED_M = 0.08
 # Largest way of an object's middle from one frame set to the next, metres: 2 m/s at 15 a second
 STEP_M = 0.15

@@ -12,7 +12,7 @@ from intercap_core.entries import ContinuousSymmetry, Symmetry
 from intercap_core.geometry.camera.transforms import rotation_exp
 from intercap_core.geometry.rigid.distance import DistanceField
 
-ALIKE_M = 0.003  # surfaces this near to each other are equal: accuracy of a scan (bench)
+ALIKE_M = 0.003  # surfaces this near to each other are equal; error of a scan
 ALIKE_SHARE = 0.95  # least share of the surface that a symmetry maps onto itself
 ORDERS = (2, 3, 4, 6)
 SAMPLES = 4000

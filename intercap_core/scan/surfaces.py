@@ -28,7 +28,7 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.schemas import PERSON, SCENE
 
 UNKNOWN, OBJECT, OTHER = 0, 1, 2  # what a pixel shows
-ON_SKIN_M = 0.008  # points this near to the fitted skin may be skin: errors of hands (bench)
+ON_SKIN_M = 0.008  # points this near to the fitted skin may be skin; mean error of hands
 GAP_M = 0.10  # parts of an object that a hand separates are nearer to each other: its breadth
 MIN_POINTS = 60  # of a part in one frame set, all cameras
 NORMAL_RADIUS_M = 0.015  # neighbourhood of a normal: three pixels of a Kinect at 2 m

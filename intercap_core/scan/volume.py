@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from intercap_core.scan.surfaces import OBJECT, UNKNOWN
 
 # Largest distance before and behind a measured surface that is averaged. Both are equal, because
-# with less behind the surface than before it, noise makes the object smaller (bench).
+# with less behind the surface than before it, noise makes the object smaller (bench/RESULTS.md).
 BAND_M = 0.010
 # Scale of the weight of a distance. Near one side of a thin wall, measurements of that side count
 # more than those of the other side. Noise of depth and poses, metres.
