@@ -4,6 +4,7 @@ import gc
 import sys
 from contextlib import nullcontext
 
+from intercap_core.memory import return_freed_memory
 from intercap_core.pipeline.job import benchmark, job
 from intercap_core.stage_list import STAGES
 
@@ -29,5 +30,6 @@ for stage, log in zip(stages, snakemake.log, strict=True):
             raise
         failed.add(stage)
     gc.collect()
+    return_freed_memory()
 if failed:
     sys.exit(1)
