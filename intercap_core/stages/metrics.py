@@ -23,6 +23,7 @@ from intercap_core.flags import OF_BODY, PARTS, Cause, Flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.memory import return_freed_memory
 from intercap_core.schemas import (
     JOINT,
     METRICS,
@@ -74,6 +75,7 @@ def run(
         # The error model of the verdict was fitted to results of this program, so imported results
         # have none.
         if settings.hold_out and not made_by:
+            return_freed_memory()
             for key, value in sorted(reach_verdict(paths, models, fit_settings).items()):
                 writer.put(f"verdict/{key}", value)
 

@@ -48,6 +48,7 @@ from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.windows import split_frames
+from intercap_core.memory import return_freed_memory
 from intercap_core.object_track.view_report import ViewReport
 
 
@@ -90,6 +91,7 @@ class Refits:
         for term in assembly.problem.terms:
             if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)
+        return_freed_memory()
         self._bands = np.empty_like(self._rest.bands)
         everything = np.ones((len(state), assembly.body.num_cameras, 2), bool)
         solution = self._solve(everything, gradients)

@@ -206,8 +206,8 @@ class ObjectInBody(JointTerm):
         if not len(some):
             return _DeepestPoints.none()
         # faces that are nearest to a point, and their neighbours, which determine normals
-        around = _in_box(skin, points[some], 2 * reach)
-        used, faces = np.unique(self._faces[around[self._faces].any(axis=1)], return_inverse=True)
+        close = _in_box(skin, points[some], 2 * reach)
+        used, faces = np.unique(self._faces[close[self._faces].any(axis=1)], return_inverse=True)
         embedded = find_embedded(points[some], skin[used], faces.reshape(-1, 3))
         # the deepest point at each vertex, and the number of points inside there
         order = np.argsort(embedded.distance, kind="stable")
