@@ -3,6 +3,8 @@
 Colour packets are JPEG files, or raw images in some modes; depth packets are big-endian numbers.
 Device time is block time + ``K4A_START_OFFSET_NS``, in whole microseconds. Sources of the tags and
 tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the SDK's reader (MIT).
+Orbbec's K4A wrapper, for Femto cameras, has the same recorder; it sets the device's clock to the
+host's, so that device times count from 1970 (timer_sync_with_host in ob_k4a_impl.cpp).
 """
 
 from __future__ import annotations
@@ -262,7 +264,7 @@ class KinectFile(ClosedOnExit):
     def _microseconds(self, tag: str, most: int) -> int:
         """A tag that states nanoseconds, in microseconds; 0 without the tag."""
         value = self._container.metadata.get(tag, "0")
-        microseconds = round(int(value) / 1000) if re.fullmatch("-?[0-9]{1,18}", value) else None
+        microseconds = round(int(value) / 1000) if re.fullmatch("-?[0-9]{1,20}", value) else None
         if microseconds is not None and abs(microseconds) <= most:
             return microseconds
         raise UserError(

@@ -46,7 +46,7 @@ from intercap_core.inputs.files import UnreadableFile, check_file
 
 # FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
-LATEST_US = 10**15  # of a device's clock: thirty years; later times are damage
+LATEST_US = 10**16  # of a device's clock, which may count from 1970; later times are damage
 _REMOVE_ROTATION = "remove the rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
 # Exif orientation by the matrix [a b; c d] of a track, with x' = a x + c y and y' = b x + d y.
 # Source: ISO/IEC 14496-12, 8.3.2.

@@ -169,6 +169,14 @@ def another_video(path: Path, whole: bytes) -> None:
         container.mux(stream.encode())
 
 
+def test_clocks_that_count_from_1970_are_read(tmp_path):
+    """Orbbec's K4A wrapper sets the clock of a Femto camera to that of the computer."""
+    start_us = 1_760_000_000_123_456
+    path = write(tmp_path / "femto.mkv", start_offset_ns=start_us * 1000)
+    times = [p.device_time_us for p in read(path) if p.kind == "depth"]
+    assert times == [start_us + index * 33_333 for index in range(5)]
+
+
 def tagged(**times_ns):
     return lambda path, whole: write(path, calibration_json=CALIBRATION, **times_ns)
 
