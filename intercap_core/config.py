@@ -35,6 +35,10 @@ class FramesSettings(Model):
     """Names of the cameras to use; empty = all. Other cameras are treated as not recorded."""
     depth: bool = True
     """Use depth images. If false, all cameras are treated as colour cameras without depth."""
+    stereo_baseline_m: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Distance between the two infrared lenses of depth cameras that measure by stereo, metres
+    (RealSense D415 0.055, D435 0.050, D455 0.095), unless the recording states it; 0 = time of
+    flight. Noise of stereo grows with squared distance."""
 
 
 class DetectionsSettings(Model):
@@ -322,9 +326,9 @@ class StudioCapture(Model):
     """simulated = true keypoints with errors; measured = with errors as those of a real detector;
     mediapipe = detected in the images, and those of measured in another folder; see
     docs/studio.md."""
-    depth_errors: Literal["usual", "large"] = "usual"
+    depth_errors: Literal["usual", "large", "stereo"] = "usual"
     """large = depth biases of up to 11 mm, growing with distance and incidence, and holes at thin
-    parts; see docs/studio.md."""
+    parts; stereo = noise of a stereo camera with a baseline of 50 mm; see docs/studio.md."""
     keypoint_bias: Annotated[float, Field(ge=0, le=3)] = 1.0
     """Scale of the detector's joint offsets from the body's joints, which are 10 to 20 mm at 1."""
     room: Literal["random", "furnished", "sparse", "bare"] = "random"

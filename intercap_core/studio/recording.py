@@ -112,7 +112,9 @@ class Kinect:
         large = None
         if stage.depth_errors == "large":
             large = LargeErrors.draw(stage.noise, len(stage.rig.true))[self.index]
-        sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode, large)
+        sensor = DepthSensor(
+            depth_view, stage.noise, name, stage.depth_mode, large, stage.depth_errors == "stereo"
+        )
         rng = stage.noise.rng("photo", name)
         gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
         photographer = Photographer(colour_view, gain, rng)

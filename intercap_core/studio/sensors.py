@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import stereo_depth_noise
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.capture_folder import SOUND_RATE as RATE
 from intercap_core.studio.noise import NoiseSource, gaussian
@@ -26,6 +27,9 @@ LIMITS = {
     "WFOV_2X2BINNED": (0.23, 3.2, 1.2),
     "WFOV_UNBINNED": (0.23, 2.5, 2.0),
 }
+
+
+STEREO_BASELINE_M = 0.050  # of a RealSense D435 (data sheet of the D400 series)
 
 
 @dataclass(frozen=True)
@@ -85,12 +89,15 @@ class DepthSensor:
         name: str,
         mode: str = "NFOV_UNBINNED",
         large: LargeErrors | None = None,
+        stereo: bool = False,
     ) -> None:
         self.view, self._noise, self._limits = view, noise, LIMITS[mode]
         rng = noise.rng("depth", name)
         self._rng = rng
         self.bias = float(noise.tails(rng.normal(size=1))[0]) * self.bias_m * noise.scale
         self._large = large
+        if stereo:
+            self.noise_m, self.noise_per_m2 = 0.0, stereo_depth_noise(view.lens, STEREO_BASELINE_M)
         if large is not None:
             self.bias = large.bias_m
             self.edge_m, self.edge_px = large.edge_m, large.edge_px
