@@ -73,7 +73,7 @@ Position = tuple[Metres, Metres, Metres]
 
 FrameNumber = Annotated[int, Field(ge=0, strict=True)]
 
-LayoutName = Literal["k4a", "intercap", "behave", "plain"]
+LayoutName = Literal["k4a", "ros", "intercap", "behave", "plain"]
 
 
 class Model(BaseModel):

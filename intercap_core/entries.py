@@ -41,8 +41,10 @@ class SequenceEntry(Model):
     recordings: Path
     """Folder of the recordings, with one file or folder per camera."""
     layout: LayoutName = "k4a"
-    """Layout of the recordings: k4a = Azure Kinect files; intercap, behave = files of these
-    releases; plain = images and videos. See docs/recordings.md."""
+    """Layout of the recordings: k4a = Azure Kinect files; ros = bags of ROS; intercap, behave =
+    files of these releases; plain = images and videos. See docs/recordings.md."""
+    topics: str | None = None
+    """Topics of a bag to use if a camera has several streams of one kind, separated by spaces."""
     calibration: Path
     """File or folder of the camera calibration: the layout's own format (docs/recordings.md), or a
     file of Pose2Sim, Anipose, EasyMocap, COLMAP or nerfstudio."""

@@ -15,3 +15,7 @@ class UserError(Exception):
         if len(text) <= most:
             return text
         return f"{text[: most // 2]} [...] {text[-most // 2 :]}"
+
+
+class MissingPackage(UserError):
+    """A package of an extra is not installed; the message names the extra."""

@@ -109,8 +109,8 @@ STAGES: dict[str, Stage] = {
             purpose="Recordings to synchronised frame sets.",
             reads=(),
             columns=(
-                "layout", "recordings", "calibration", "calibration_scale", "calibration_up",
-                "calibration_floor",
+                "layout", "recordings", "topics", "calibration", "calibration_scale",
+                "calibration_up", "calibration_floor",
             ),
             resources=JobResources(160, seconds=5, seconds_per_image=0.01),
             output_bytes=750_000_000,

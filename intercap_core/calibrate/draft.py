@@ -15,6 +15,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.opencv import read_content
 from intercap_core.formats.recordings import k4a, plain
+from intercap_core.formats.recordings.ros import layout as ros
 
 _POSE_FIELDS = ("R", "T", "rvec", "tvec")
 _LENS_FIELDS = ("camera_matrix", "distortion_coefficients")
@@ -27,7 +28,8 @@ class RigDraft:
     names: tuple[str, ...]
     """Names of the cameras by the recordings, the master first."""
     content: dict[str, Any] | None
-    """Calibration in OpenCV's terms that the result completes; None for Azure Kinects."""
+    """Calibration in OpenCV's terms that the result completes; None if the recordings hold the
+    lenses."""
     without_lens: frozenset[str]
     """Cameras whose lens is not stated."""
 
@@ -48,13 +50,13 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
             f"{row.recordings}: sequence {row.sequence!r} has no such folder of recordings; "
             "correct 'recordings' in the table of sequences"
         )
-    if row.layout not in ("k4a", "plain"):
+    finders = {"k4a": k4a.find_cameras, "ros": ros.find_cameras, "plain": plain.find_cameras}
+    if row.layout not in finders:
         raise UserError(
             f"sequence {row.sequence!r} has layout {row.layout}, whose release holds the cameras' "
-            "poses; expected layout k4a or plain"
+            "poses; expected layout k4a, ros or plain"
         )
-    finder = k4a.find_cameras if row.layout == "k4a" else plain.find_cameras
-    names = finder(row.recordings)
+    names = finders[row.layout](row.recordings)
     if not names:
         raise UserError(
             f"{row.recordings}: holds no recording of layout {row.layout}; correct 'recordings' or "
@@ -65,7 +67,7 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
             f"{row.recordings}: holds recordings of camera {names[0]!r} only, expected two cameras "
             "or more; one camera needs no poses: write its lens with R and T zero"
         )
-    if row.layout == "k4a":
+    if row.layout != "plain":  # the recordings hold the lenses
         return RigDraft(_ordered(names, master, row.recordings), None, frozenset())
     source = lenses or (row.calibration if row.calibration.exists() else None)
     content = _read_lenses(source)

@@ -1,5 +1,5 @@
 """Layouts of a capture's folder: Azure Kinect files, the releases of InterCap and BEHAVE, plain
-images.
+images. Bags of ROS are in :mod:`.ros`.
 
 In the table of sequences, ``recordings`` is the capture's folder and ``calibration`` is
 :attr:`CaptureFolder.calibration` in it.
@@ -36,6 +36,7 @@ from intercap_core.studio.capture_folder import (
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.render import Aligner
 from intercap_core.studio.rig import STAGGER_S
+from intercap_core.studio.ros import RosFolder
 
 BEHAVE_DATE = "Date01"  # folder of the calibration
 
@@ -303,6 +304,7 @@ def _write_json(path: Path, content: object) -> None:
 
 FOLDERS: dict[LayoutName, type[CaptureFolder]] = {
     "k4a": KinectFolder,
+    "ros": RosFolder,
     "intercap": ReleaseFolder,
     "behave": BehaveFolder,
     "plain": PlainFolder,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -10,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core import artefacts
+from intercap_core.config import FramesSettings, StudioCapture, StudioSettings
 from intercap_core.config_types import LayoutName
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
@@ -18,6 +20,8 @@ from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import Image
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.schemas import FRAMES
+from intercap_core.stages import frames
 from intercap_core.studio.capture_folder import Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.render import Aligner
@@ -26,6 +30,12 @@ from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 
 FPS, SETS = 15, (0, 1, 4)
 LAYOUTS = get_args(LayoutName)
+SETTINGS = FramesSettings()
+COMPARED = (
+    "master_from_colour", "colour_from_depth", "colour_intrinsics", "colour_distortion",
+    "colour_size", "depth_intrinsics", "depth_distortion", "depth_size", "present", "truncated",
+    "times", "colour_index", "depth_index", "skew",
+)  # fmt: skip
 
 
 def rig_of(layout: LayoutName, cameras: int = 3) -> StudioRig:
@@ -37,7 +47,7 @@ def rig_of(layout: LayoutName, cameras: int = 3) -> StudioRig:
 
 def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),
           broken: dict[str, int] | None = None, cameras: int = 3, video: bool = False,
-          ) -> tuple[StudioRig, bytes, np.ndarray]:  # fmt: skip
+          sets: Iterable[int] = SETS) -> tuple[StudioRig, bytes, np.ndarray]:  # fmt: skip
     """A recording of a grey wall, two metres before every depth camera."""
     rig = rig_of(layout, cameras)
     jpeg = cv2.imencode(".jpg", np.full((720, 1280, 3), 90, np.uint8))[1].tobytes()
@@ -49,7 +59,7 @@ def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),
     for index, camera in enumerate(rig.claimed):
         device = Device(index, camera, f"{index}", "720P", "NFOV_UNBINNED", True, FPS, 1_000_000)
         with place.open(device) as files:
-            for t in SETS:
+            for t in sets:
                 time_us = 1_000_000 + round(t * 1e6 / FPS) + 160 * index
                 files.write(DeviceFrame(t, time_us, jpeg, depth if t else None, []))
     place.write_calibration(rig.claimed, FPS)
@@ -62,6 +72,28 @@ def row_of(folder: Path, layout: LayoutName) -> SequenceEntry:
         sequence="one", subject="p", object="cup", recordings=folder, layout=layout,
         calibration=calibration,
     )  # fmt: skip
+
+
+def test_a_bag_gives_the_frames_artefact_of_a_kinect_file(tmp_path: Path) -> None:
+    """Equal images, times, sets, poses, lenses; the bag lacks gravity and the lens's limit."""
+    written = {}
+    for layout in ("k4a", "ros"):
+        (tmp_path / layout).mkdir()
+        write(tmp_path / layout, layout, sets=range(6))
+        path = tmp_path / f"{layout}.h5"
+        frames.run(sequence=row_of(tmp_path / layout, layout), output=path, settings=SETTINGS)
+        with artefacts.read(path, FRAMES) as artefact:
+            assert artefact.attributes["fps"] == pytest.approx(FPS, rel=1e-4)
+            written[layout] = {key: artefact[key] for key in COMPARED}
+            for name in artefact.text("camera_names"):
+                for key in ("colour", "colour_offsets", "colour_time", "depth", "depth_time"):
+                    key = f"cameras/{name}/{key}"
+                    written[layout][key] = artefact[key]
+    for key, of_kinect in written["k4a"].items():
+        exact = of_kinect.dtype.kind in "iub"
+        tolerance = 0 if exact else 1e-9
+        np.testing.assert_allclose(written["ros"][key], of_kinect, atol=tolerance, err_msg=key)
+    assert (written["ros"]["depth_index"] >= 0).sum() == 15
 
 
 def images_of(folder: Path, layout: LayoutName, name: str) -> tuple[Camera, list[Image]]:
@@ -93,7 +125,7 @@ def test_recordings_are_read_as_written(tmp_path: Path, layout: LayoutName, vide
         depths = [image for image in images if image.kind == "depth"]
         assert [image.time_us for image in depths] == times[1:].tolist()
         assert camera.depth is not None and camera.colour_from_depth is not None
-        if layout in ("k4a", "plain"):
+        if layout in ("k4a", "ros", "plain"):
             assert all(np.array_equal(image.content, depth) for image in depths)
             np.testing.assert_allclose(camera.colour_from_depth, claimed.colour_from_depth)
         else:

@@ -3,7 +3,7 @@
 A frame set holds one image of each camera, all taken at nearly the same time. The number by which
 files refer to an image depends on the layout of the recording:
 
-- ``k4a``, ``behave``, videos: its position among the camera's copied images, from 0;
+- ``k4a``, ``ros``, ``behave``, videos: its position among the camera's copied images, from 0;
 - ``plain``: its position among the camera's image files, damaged ones included;
 - ``intercap``: the number in the image file's name.
 

@@ -276,3 +276,18 @@ def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.n
         "BGRA": ((height, width, 4), cv2.COLOR_BGRA2BGR),
     }[pixel_format]
     return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(shape), code)
+
+
+def to_millimetres(depth: np.ndarray, unit_m: float) -> np.ndarray:
+    """Convert depth (H, W) in units of ``unit_m`` metres to uint16, millimetres, 0 = invalid.
+
+    Invalid are 0, numbers that are not finite, distances above 65.534 m, and the largest number of
+    16 bits, which sensors write where they measure nothing.
+    """
+    if depth.dtype == np.uint16:
+        depth = np.where(depth == np.iinfo(np.uint16).max, 0, depth)
+        if unit_m == 0.001:
+            return depth
+    millimetres = np.rint(depth * (1000 * unit_m))
+    valid = (millimetres > 0) & (millimetres < np.iinfo(np.uint16).max)  # False for NaN
+    return np.where(valid, millimetres, 0).astype(np.uint16)

@@ -23,6 +23,7 @@ from intercap_core.formats.recordings.encodings import (
     holds_all_pixels,
     stated_orientation,
     store_colour,
+    to_millimetres,
 )
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
 from intercap_core.formats.recordings.synchronise import distance_to
@@ -91,11 +92,7 @@ def read_depth(path: Path, size: tuple[int, int], unit_m: float = 0.001) -> np.n
             "calibration states its unit)"
         )
     _check_depth_size(image.shape[::-1], size)
-    image[image == np.iinfo(np.uint16).max] = 0
-    if unit_m == 0.001:
-        return image
-    millimetres = np.rint(image * (1000 * unit_m))
-    return np.where(millimetres < 1 << 16, millimetres, 0).astype(np.uint16)
+    return to_millimetres(image, unit_m)
 
 
 def _check_depth_head(content: bytes, size: tuple[int, int]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from intercap_core.config_types import LayoutName
 from intercap_core.entries import SequenceEntry
-from intercap_core.errors import UserError
+from intercap_core.errors import MissingPackage, UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout
@@ -19,6 +19,7 @@ from intercap_core.inputs.files import describe_unread
 # that folder). A folder stands for all files below it.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.[mM][kK][vV]",),
+    "ros": ("*.bag", "*.mcap", "*.db3", "*/*.mcap", "*/*.db3"),
     "intercap": ("[fF][rR][aA][mM][eE][sS]_[cC][aA][mM]*/*",),
     "behave": ("",),
     "plain": (
@@ -36,6 +37,10 @@ _DEEPEST = 3  # levels of folders below the recordings that are searched
 # path with "/" matches is read as a whole. Names in braces are those of :func:`list_unread`.
 _READ: dict[LayoutName, tuple[str, str]] = {
     "k4a": (r"[^/]+\.mkv", "<camera>.mkv"),
+    "ros": (
+        r"[^/]+\.bag|([^/]+/)?[^/]+\.(mcap|db3)",
+        "<camera>.bag (.mcap, .db3), a bag of several cameras, or bag folders of ROS 2",
+    ),
     "intercap": (
         r"frames_cam\d{1,2}/(colou?r/\D*\d{1,9}\.(jpe?g|png)|depth[^/]*/\D*\d{1,9}\.png)",
         "Frames_Cam<n>/color/<number>.jpg (or .png) and depth/<number>.png",
@@ -117,19 +122,24 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
 def recognise_recordings(folder: Path) -> tuple[LayoutName, list[str]] | None:
     """The layout of the recordings in a folder, and the names of their cameras; None without any.
 
-    Folders of images and videos are recordings only if there are two of them or more.
+    Folders of images and videos are recordings only if there are two of them or more. Raises
+    UserError for bags of ROS if the package that reads them is missing.
     """
     from intercap_core.formats.recordings import behave, intercap, k4a, plain
+    from intercap_core.formats.recordings.ros import layout as ros
 
     finders: dict[LayoutName, Callable[[Path], list[str]]] = {
         "intercap": lambda path: list(intercap.find_camera_folders(path)),
         "behave": behave.find_cameras,
         "k4a": k4a.find_cameras,
+        "ros": ros.find_cameras,
         "plain": plain.find_cameras,
     }
     for layout, find_cameras in finders.items():
         try:
             cameras = find_cameras(folder)
+        except MissingPackage:
+            raise
         except UserError:
             continue
         if len(cameras) > (1 if layout == "plain" else 0):
@@ -155,6 +165,10 @@ def open_layout(sequence: SequenceEntry) -> RecordingLayout:
             from intercap_core.formats.recordings.k4a import KinectLayout
 
             return KinectLayout(sequence)
+        case "ros":
+            from intercap_core.formats.recordings.ros.layout import RosLayout
+
+            return RosLayout(sequence)
         case "intercap":
             from intercap_core.formats.recordings.intercap import InterCapLayout
 

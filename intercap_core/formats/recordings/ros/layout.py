@@ -1,0 +1,251 @@
+"""Layout ``ros``: bags of ROS 1 and ROS 2, one for all cameras or one for each.
+
+Schemes of topics are tried in the order of :data:`SCHEMES`; a new one is one file and one entry.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.entries import SequenceEntry
+from intercap_core.errors import MissingPackage, UserError
+from intercap_core.formats.calibration.extrinsics import (
+    Extrinsics,
+    check_camera_name,
+    read_extrinsics,
+)
+from intercap_core.formats.calibration.files import (
+    RecordedCameras,
+    read_tool_calibration,
+    refuse_scale,
+)
+from intercap_core.formats.calibration.opencv import check_rate
+from intercap_core.formats.recordings.encodings import DamagedImage, encoded_size
+from intercap_core.formats.recordings.ros import orbbec, realsense, standard
+from intercap_core.formats.recordings.ros.bag import Bag, find_bags, is_bag
+from intercap_core.formats.recordings.ros.images import decode_colour, decode_depth
+from intercap_core.formats.recordings.ros.lenses import STATIC_TRANSFORMS, StaticTransforms
+from intercap_core.formats.recordings.ros.streams import CameraStreams, Scheme, Stream
+from intercap_core.formats.recordings.source import (
+    CameraRecording,
+    Image,
+    RecordingLayout,
+    RecordingPreview,
+)
+from intercap_core.formats.recordings.timestamps import frame_rate
+from intercap_core.geometry.camera.rig import Camera, stereo_depth_noise
+from intercap_core.inputs.files import name_some
+
+SCHEMES: tuple[Scheme, ...] = (realsense.SCHEME, orbbec.SCHEME, standard.SCHEME)
+RATE_IMAGES = 16  # first images, whose times give the rate
+# A topic that ends earlier than the camera's other one by more has stopped, seconds.
+STOPPED_S = 1.0
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a camera's recording is."""
+
+    path: Path
+    """The bag."""
+    name: str
+    """Name of the camera in its scheme."""
+    fault: str = ""
+    """Why the bag cannot be read."""
+
+
+def find_cameras(recordings: Path) -> list[str]:
+    """Names of the cameras in the bags of a folder; raises UserError as the layout does."""
+    return sorted(_find_places(recordings)) if find_bags(recordings) else []
+
+
+def _find_places(recordings: Path) -> dict[str, _Place]:
+    """Cameras by name: in a single bag that of their topics, else that of the file."""
+    bags = find_bags(recordings)
+    places: dict[str, _Place] = {}
+    topics: list[str] = []
+    for path in bags:
+        fault = ""
+        try:
+            with Bag(path) as bag:
+                names = _scheme_of(bag).list_cameras(bag)
+                topics += list(bag.topics)
+        except MissingPackage:
+            raise
+        except UserError as error:
+            names, fault = [""], str(error)
+        for name in names:
+            own = name if name and (len(bags) == 1 or len(names) > 1) else path.stem
+            check_camera_name(path, own)
+            if own in places:
+                raise UserError(
+                    f"{recordings}: {places[own].path.name} and {path.name} both record a camera "
+                    f"{own}; rename one of them"
+                )
+            places[own] = _Place(path, name, fault)
+    if bags and not places:
+        raise UserError(
+            f"{recordings}: no bag has a topic of type sensor_msgs/Image or CompressedImage; it "
+            f"has {name_some(sorted(set(topics)), 8) or 'no messages'}"
+        )
+    return places
+
+
+def _scheme_of(bag: Bag) -> Scheme:
+    return next(scheme for scheme in SCHEMES if scheme.recognises(bag))
+
+
+class RosLayout(RecordingLayout):
+    """The bags in a folder, or a folder that is a bag of ROS 2.
+
+    Poses are those of static transforms if ``calibration`` is a bag or the folder of the
+    recordings, else those of a rig file or of another tool. Lenses are those in the bags.
+    """
+
+    def __init__(self, sequence: SequenceEntry) -> None:
+        super().__init__(sequence)
+        self._places = _find_places(sequence.recordings)
+        self.names = sorted(self._places)
+        path, scale = sequence.calibration, sequence.calibration_scale
+        if is_bag(path) or path == sequence.recordings:
+            refuse_scale(path, scale)
+            self.extrinsics = self._static_poses(path)
+            return
+        other = read_tool_calibration(path, RecordedCameras(self.names), scale)
+        if other is None:
+            refuse_scale(path, scale)
+        self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics
+
+    def _static_poses(self, path: Path) -> Extrinsics:
+        """Poses of all cameras; raises UserError if one of them cannot be read."""
+        fault = next((place.fault for place in self._places.values() if place.fault), "")
+        if fault:
+            raise UserError(fault)
+        paths = {place.path for place in self._places.values()} | (
+            {path} if is_bag(path) else set()
+        )
+        with contextlib.ExitStack() as opened:
+            bags = {path: opened.enter_context(Bag(path)) for path in sorted(paths)}
+            frames = {
+                name: self._streams(bags[place.path], place).frame
+                for name, place in sorted(self._places.items())
+            }
+            transforms = StaticTransforms(bags.values())
+        if transforms.is_empty or not all(frames.values()):
+            raise UserError(
+                f"{path}: holds no static transforms of cameras ({STATIC_TRANSFORMS}); record that "
+                "topic, or name a rig file in the column calibration"
+            )
+        return transforms.extrinsics(path, frames)
+
+    def _streams(self, bag: Bag, place: _Place) -> CameraStreams:
+        return _scheme_of(bag).read(bag, place.name, (self.sequence.topics or "").split())
+
+    def open(self, name: str) -> CameraRecording:
+        """Open the camera's streams.
+
+        Raises UserError for a damaged bag, and if lenses are missing or topics are ambiguous.
+        """
+        place = self._places[name]
+        if place.fault:
+            raise UserError(place.fault)
+        bag = Bag(place.path)
+        try:
+            streams = self._streams(bag, place)
+            return RosRecording(bag, streams, name, self.extrinsics)
+        except BaseException:
+            bag.close()
+            raise
+
+
+class RosRecording(CameraRecording):
+    """The two streams of one camera."""
+
+    def __init__(self, bag: Bag, streams: CameraStreams, name: str, extrinsics: Extrinsics) -> None:
+        self._bag, self._streams = bag, streams
+        depth = streams.depth
+        camera = Camera(
+            name,
+            streams.colour.lens,
+            None if depth is None else depth.lens,
+            streams.colour_from_depth,
+            extrinsics.master_from_colour[name],
+            stereo_depth_noise(depth.lens, streams.stereo_baseline_m) if depth else 0.0,
+        )
+        colour = streams.colour
+        first = list(islice(bag.messages(colour.topic), RATE_IMAGES))
+        times = np.array([_time_us(colour, recorded, message) for _, recorded, message in first])
+        rate = frame_rate(times) or 30.0
+        check_rate(rate, f"{bag.path}: {colour.topic}")
+        super().__init__(bag.path, camera, fps=rate, serial=streams.serial)
+        if not colour.times_us and not any(_stamp_ns(message) for _, _, message in first):
+            self.timing = "by time of recording"
+            self.notes.append("its headers state no times; images have the times of recording")
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._bag.close()
+
+    def preview(self) -> RecordingPreview:
+        """Inspect the first image and the number of messages."""
+        topic = self._streams.colour.topic
+        size, remark = None, ""
+        with contextlib.suppress(DamagedImage):
+            content, remark = decode_colour(self._bag.first(topic))
+            size = encoded_size(content)
+        count = self._bag.topics[topic].messages
+        remarks = (f"colour images {remark}",) if remark else ()
+        return RecordingPreview(size, count, (count - 1) / self.fps, remarks=remarks)
+
+    def images(self) -> Iterator[Image]:
+        """Yield the images of both topics; damaged colour becomes an empty image."""
+        streams = {s.topic: s for s in (self._streams.colour, self._streams.depth) if s is not None}
+        remarks: Counter[str] = Counter()
+        last_ns: dict[str, int] = {}
+        damaged = 0
+        for topic, recorded, message in self._bag.messages(*streams):
+            stream, last_ns[topic] = streams[topic], recorded
+            time_us = _time_us(stream, recorded, message)
+            if stream is self._streams.depth:
+                try:
+                    yield Image("depth", time_us, decode_depth(message, stream.unit_m))
+                except DamagedImage:
+                    damaged += 1
+                continue
+            content, remark = b"", ""
+            with contextlib.suppress(DamagedImage):
+                content, remark = decode_colour(message)
+            remarks[remark] += bool(remark)
+            yield Image("colour", time_us, content)
+        self.notes += [f"{n} colour images {text}" for text, n in remarks.items() if n]
+        if damaged:
+            self.notes.append(f"{damaged} damaged depth images left out")
+        self._note_stop(last_ns)
+
+    def _note_stop(self, last_ns: dict[str, int]) -> None:
+        """Note a topic that stops before the other one."""
+        if len(last_ns) < 2:
+            return
+        (early, first), (late, last) = sorted(last_ns.items(), key=lambda item: item[1])
+        if (last - first) * 1e-9 > STOPPED_S:
+            self.notes.append(f"topic {early} stops {(last - first) * 1e-9:.1f} s before {late}")
+
+
+def _time_us(stream: Stream, recorded: int, message: Any) -> int:
+    """Device time of an image; its time of recording if the header states none."""
+    known = stream.times_us.get(recorded)
+    return known if known is not None else (_stamp_ns(message) or recorded) // 1000
+
+
+def _stamp_ns(message: Any) -> int:
+    """Time in the header, nanoseconds; 0 = not set."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
