@@ -81,9 +81,9 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
     recordings = [recording for recording in found if recording.folder not in masks]
     if not recordings:
         raise UserError(
-            f"{root}: holds no recordings that are recognised; expected Azure Kinect files, a "
-            "folder of images or a video for each of two or more cameras, or the folders of the "
-            "InterCap or BEHAVE release (docs/recordings.md)"
+            f"{root}: holds no recordings that are recognised; expected Azure Kinect files, "
+            "bags of ROS, a folder of images or a video for each of two or more cameras, or the "
+            "folders of the InterCap or BEHAVE release (docs/recordings.md)"
         )
     result = Draft(dataset)
     used = frozenset(recording.folder for recording in recordings)

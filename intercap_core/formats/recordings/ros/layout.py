@@ -183,7 +183,7 @@ class RosRecording(CameraRecording):
         colour = streams.colour
         first = list(islice(bag.messages(colour.topic), RATE_IMAGES))
         times = np.array([_time_us(colour, recorded, message) for _, recorded, message in first])
-        rate = frame_rate(times) or 30.0
+        rate = round(frame_rate(times) or 30.0, 2)  # times are whole microseconds
         check_rate(rate, f"{bag.path}: {colour.topic}")
         super().__init__(bag.path, camera, fps=rate, serial=streams.serial)
         if not colour.times_us and not any(_stamp_ns(message) for _, _, message in first):

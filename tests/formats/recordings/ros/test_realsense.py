@@ -19,8 +19,10 @@ from tests.formats.recordings.ros.test_standard import row
 from tests.helpers.ros_files import (
     COLOUR_SIZE,
     DEPTH_SIZE,
+    BagFile,
     colour_image,
     depth_image,
+    png,
     pose,
     rig_file,
 )
@@ -142,3 +144,51 @@ def test_fisheye_colour_is_refused(tmp_path: Path) -> None:
     Recorded(file_written(tmp_path), rs.distortion.kannala_brandt4)
     with pytest.raises(UserError, match=r"Color_0/.*camera_info: its distortion model is 'Kannala"):
         open_layout(row(tmp_path, calibration=rig_file(tmp_path, "k1"))).open("k1")
+
+
+def test_text_in_bags_of_ros_2_is_read(tmp_path: Path) -> None:
+    """Topics and text as release 2.59 of the recorder wrote them to a ``.db3``."""
+    prefix, times = "/device_0/sensor_0", [5_000_000, 5_033_333]
+    rotation = ",".join(f"{value:.6f}" for value in COLOUR_FROM_DEPTH[:3, :3].T.ravel())
+    translation = ",".join(f"{value:.6f}" for value in COLOUR_FROM_DEPTH[:3, 3])
+    numbers = ",".join(map(str, COEFFICIENTS))
+    texts = {
+        "/device_0/info": "Name=Intel RealSense D455;Serial Number=012345",
+        f"{prefix}/option/Depth_Units/value": "0.000500",
+        f"{prefix}/option/Stereo_Baseline/value": "95.000000",
+        f"{prefix}/Depth_0/camera_info": "width=40;height=30;fx=38;ppx=20.5;fy=39;ppy=14.75;"
+        "model=Brown Conrady;coeffs=0,0,0,0,0",
+        "/device_0/sensor_1/Color_0/camera_info": "width=64;height=48;fx=60;ppx=32.5;fy=61;"
+        f"ppy=23.75;model=Inverse Brown Conrady;coeffs={numbers}",
+        f"{prefix}/Depth_0/tf/ref_1": "rotation=1,0,0,0,1,0,0,0,1;translation=0,0,0",
+        "/device_0/sensor_1/Color_0/tf/ref_1": f"rotation={rotation};translation={translation}",
+    }
+    with BagFile(tmp_path / "k1", "db3") as bag:
+        for topic, text in texts.items():
+            bag.add(topic, "std_msgs/msg/String", 0, data=text)
+        for t, time_us in enumerate(times):
+            at = t * 40_000_000 + 701  # time of recording, since the start
+            for topic, content, text in (
+                (
+                    f"{prefix}/Depth_0",
+                    bytes(12) + png(depth_image(t)),
+                    "16UC1; compressedDepth png",
+                ),
+                ("/device_0/sensor_1/Color_0", png(colour_image(t)), "rgb8; png compressed bgr8"),
+            ):
+                transport = "Depth" if "Depth" in text else ""
+                where = f"{topic}/image/data/compressed{transport}"
+                bag.compressed(where, at, topic[-7:-2], content, text)
+                stated = f"Frame number={t};system_time=0.000000;timestamp={time_us / 1000:.6f};"
+                bag.add(f"{topic}/image/metadata", "std_msgs/msg/String", at, data=stated)
+    with open_layout(row(tmp_path, calibration=rig_file(tmp_path, "k1"))).open("k1") as recording:
+        camera, images = recording.camera, list(recording.images())
+    assert camera.depth is not None and camera.colour_from_depth is not None
+    assert np.allclose(camera.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-5)
+    assert np.allclose(camera.colour.distortion[:5], COEFFICIENTS)
+    assert camera.depth_noise == pytest.approx(0.08 / (38.0 * 0.095))
+    for kind in ("colour", "depth"):
+        assert [image.time_us for image in images if image.kind == kind] == times
+    depth = [image.content for image in images if image.kind == "depth"]
+    assert np.array_equal(depth[1], np.rint(depth_image(1) * 0.5).astype(np.uint16))
+    assert [i.content for i in images if i.kind == "colour"][1] == png(colour_image(1))
