@@ -234,19 +234,20 @@ class PageSettings(Model):
 class ExportSettings(Model):
     """Files for other tools."""
 
-    formats: tuple[Literal["intercap", "amass", "bop", "coco", "glb", "contact", "meshes"], ...] = (
-        "intercap",
-        "amass",
-        "bop",
-        "coco",
-        "glb",
-        "contact",
-    )
+    formats: tuple[
+        Literal[
+            "intercap", "amass", "bop", "coco", "glb", "contact", "meshes", "rrd", "bvh", "gmr",
+            "holosoma",
+        ], ...,
+    ] = ("intercap", "amass", "bop", "coco", "glb", "contact")  # fmt: skip
     """Exported formats. contact = contact probability by frame, vertices in contact, and a draft
-    annotation; meshes = body and object of each frame as mesh files of half a megabyte each."""
+    annotation; meshes = body and object of each frame as mesh files of half a megabyte each; rrd =
+    recording for the Rerun viewer, needs the extra `rerun`; bvh = skeleton; gmr, holosoma = motion
+    for programs that retarget it to humanoids."""
     frame: Literal["z-up", "camera"] = "z-up"
-    """Coordinate frame of amass, glb and meshes: z-up = z against gravity, ground at z = 0;
-    camera = the master camera. The formats intercap, bop and coco use camera frames."""
+    """Coordinate frame of amass, glb, meshes and rrd: z-up = z against gravity, ground at z = 0;
+    camera = the master camera. The formats intercap, bop and coco use camera frames; bvh, gmr and
+    holosoma have their own."""
     mesh_format: Literal["ply", "obj"] = "ply"
     """File format of the meshes; only ply marks the vertices in contact."""
     mesh_every: Annotated[int, Field(ge=1)] = 1
@@ -275,6 +276,18 @@ class CardSettings(Model):
     """Name of the licence, such as CC-BY-4.0, or its URL; empty = the card says "not stated"."""
     creators: tuple[str, ...] = ()
     """Names of the dataset's creators."""
+    collection: str = ""
+    """Who recorded whom, where, when and how: statement of the datasheet."""
+    consent: str = ""
+    """How the recorded persons consented, and to which uses; approval by an ethics board."""
+    uses: str = ""
+    """Tasks that the data is meant for, and uses to avoid."""
+    biases: str = ""
+    """Groups of people, objects and actions that are rare or absent."""
+    social_impact: str = ""
+    """Good and harm that can come from the data's use."""
+    maintenance: str = ""
+    """Who maintains the data, and where errors are reported."""
     url: str = ""
     """URL of the dataset."""
     citation: str = ""

@@ -201,7 +201,8 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             name="export",
-            purpose="Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes.",
+            purpose="Files for other tools (setting export.formats): intercap, amass, bop, coco, "
+            "glb, contact, meshes, rrd (Rerun), bvh, gmr, holosoma.",
             reads=("frames", "joint", "scene", "metrics", "body_fit", "object_track"),
             resources=JobResources(600, mb_per_image=0.05, seconds=20, seconds_per_image=0.02),
             output_bytes=60_000_000,

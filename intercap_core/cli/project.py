@@ -350,7 +350,8 @@ def release(
 ) -> None:
     """List the dataset's files with checksums, versions and settings, for publication.
 
-    Writes release.json and release.sha256 next to the card (card.md, card.json, croissant.json);
+    Writes release.json and release.sha256 next to the card (README.md, datasheet.md,
+    card.json, croissant.json), and names the statements of the datasheet that the settings lack;
     the card's texts come from the settings' section `card`. Recipients verify the files with
     --check or with sha256sum -c release.sha256.
 

@@ -10,6 +10,7 @@ from logging.handlers import BufferingHandler
 from pathlib import Path
 
 from intercap_core.annotation import Annotation
+from intercap_core.config import ExportSettings
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import describe_unread, list_files, name_some
 from intercap_core.project import Project, read_project, tidy
@@ -93,6 +94,17 @@ def check_segmentation_model(project: Project) -> list[Fault]:
     ]
 
 
+def check_export_formats(project: Project) -> None:
+    """Raise UserError if the library of a requested export format is not installed."""
+    requested = project.config.export.formats
+    if set(requested) <= set(ExportSettings().formats):
+        return  # without the import of torch
+    from intercap_core.output.export.registry import formats
+
+    for name in requested:
+        formats()[name].require_library()
+
+
 @dataclass
 class Findings:
     """Findings on a project."""
@@ -118,6 +130,7 @@ def check_project(settings: Path) -> Findings:
     detectors = [
         lambda: check_keypoint_model(project),
         lambda: findings.notes.extend(check_segmentation_model(project)),
+        lambda: check_export_formats(project),
     ]
     for check in (*_body_checks(project), *detectors):
         try:

@@ -14,6 +14,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.inputs.files import name_some
 from intercap_core.output.release import manifest
+from intercap_core.output.release.datasheet import statements
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project, tidy
@@ -29,12 +30,14 @@ _PRINTED = 20  # paths of each kind of difference
 def write_release(project: Project, kinds: Sequence[str]) -> Path:
     """List the files of all results; returns the path of the list.
 
-    Warns if results come from several versions or settings. Raises UserError if an output of a
+    Warns if results come from several versions or settings, and of statements that the datasheet
+    lacks. Raises UserError if an output of a
     sequence, or of the dataset, is damaged or missing.
     """
     _check_complete(project)
     names = list(project.sequences)
-    made = _made([SequenceSummary.read(project.artefact(name, "summary")) for name in names])
+    summaries = [SequenceSummary.read(project.artefact(name, "summary")) for name in names]
+    made = _made(summaries)
     for stage, found in made.items():
         if len(found) > 1:
             few = min(found, key=lambda version: len(version["sequences"]))
@@ -65,8 +68,11 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
     total = sum(entry.bytes for entry in entries)
     path = project.results / manifest.MANIFEST
     log.info("%d files, %.1f MB", len(entries), total / 1e6)
-    if not config.card.licence:
-        log.warning("no licence is stated: set card.licence in %s", project.path)
+    virtual = all(summary.metrics.has_truth for summary in summaries)
+    stated = statements(config.card, virtual=virtual)
+    missing = [f"card.{statement}" for statement, text in stated.items() if not text]
+    if missing:
+        log.warning("datasheet.md has placeholders: set %s in %s", ", ".join(missing), project.path)
     return path
 
 

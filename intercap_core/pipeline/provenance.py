@@ -27,8 +27,8 @@ LIBRARIES = (
 FILE = ".made_from.json"  # manifest of a folder, inside it
 FORMAT = 1
 DATASET_OUTPUTS = (
-    "site/index.html", "summary.json", "heatmaps.h5", "tables", "card.md", "card.json",
-    "croissant.json", "export",
+    "site/index.html", "summary.json", "heatmaps.h5", "tables", "README.md", "card.json",
+    "datasheet.md", "croissant.json", "export",
 )  # fmt: skip
 _PAGES = "sequences"  # folder of the sequences' pages in the site
 _NOT_COMPARED = ("machine", "outputs")

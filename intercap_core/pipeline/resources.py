@@ -118,7 +118,8 @@ def has_model(project: Project) -> bool:
 
 def has_images(project: Project) -> bool:
     """Whether exports contain images."""
-    return project.config.export.images or project.config.export.undistort
+    settings = project.config.export
+    return settings.images or settings.undistort or "rrd" in settings.formats
 
 
 def on_gpu(project: Project, rule: str) -> bool:

@@ -23,6 +23,7 @@ from intercap_core.evaluation.summary import Heatmaps, SequenceSummary, collect_
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.release.card import facts, markdown, split_table
 from intercap_core.output.release.croissant import croissant
+from intercap_core.output.release.datasheet import datasheet
 from intercap_core.output.site import overview, tables
 from intercap_core.output.site.heat_pictures import body_surfaces, highest, object_pictures
 from intercap_core.output.site.measures import median_residuals
@@ -103,7 +104,8 @@ def run(
     _write_heatmaps(results / "heatmaps.h5", dataset, heat)
     _replace(results / "summary.json", _json(figures.summary(dataset, measured)))
     stated = facts(dataset, card, found, groups, formats=formats, failed=unreported)
-    _replace(results / "card.md", markdown(stated))
+    _replace(results / "README.md", markdown(stated))
+    _replace(results / "datasheet.md", datasheet(stated))
     _replace(results / "card.json", _json(stated))
     _replace(results / "croissant.json", _json(croissant(stated, results, written)))
     content = DatasetContent(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.config import ExportSettings
@@ -17,22 +17,14 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export import (
-    body_files,
-    bop,
-    coco,
-    contact,
-    glb,
-    images,
-    meshes,
-    parameters,
-)
+from intercap_core.output.export import body_files, images
 from intercap_core.output.export.about import About, Deviations, ExportBody, Verdict
 from intercap_core.output.export.contact import ContactVertices, StatedContact
+from intercap_core.output.export.format import Content
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
-from intercap_core.output.export.readme import NEED_OBJECT, readme
+from intercap_core.output.export.readme import readme
+from intercap_core.output.export.registry import formats
 from intercap_core.output.export.silhouettes import Scenes, body_vertices
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -41,9 +33,6 @@ from intercap_core.stage_list import STAGES
 log = logging.getLogger(__name__)
 
 MARKER = STAGES["export"].folder_marker
-_IMAGE_FORMATS = {"bop", "coco"}  # formats that annotate images
-_BODY_FORMATS = {"intercap", "amass"}  # formats of parameters, which need the body model
-_NO_FRAME = "none: numbers of vertices and regions, distances in metres"
 
 
 def run(
@@ -58,8 +47,8 @@ def run(
     README.txt lists the errors from the metrics, and the formats that are omitted because no object
     was found.
 
-    Raises UserError if an artefact or the object's mesh is missing or broken, or if the metrics
-    were measured on another joint result.
+    Raises UserError if an artefact, the object's mesh or a format's library is missing or broken,
+    or if the metrics were measured on another joint result.
     """
     with artefacts.read(paths.scene, SCENE) as scene:
         rig = Rig.from_artefact(scene)
@@ -70,68 +59,52 @@ def run(
         rig = rig.moved(fit["master_from_colour"])
         time_offset = fit["time_offset"]
     motion = read_motion(paths.joint, fps, models.body_models, models.gender, zup_from_master)
-    mesh = None
-    if models.object_ is not None:
-        mesh = ObjectMesh.load(models.object_)
-    if not motion.has_object:
-        mesh = None
-    z_up = settings.frame == "z-up"
-    viewed = motion.moved(zup_from_master, z_up_name) if z_up else motion
-    requested = sorted(set(settings.formats))
-    formats = [name for name in requested if mesh is not None or name not in NEED_OBJECT]
-    for name in set(requested) - set(formats):
-        log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
-    about = _about(paths, motion, mesh)
-    posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
-    bodies = body_vertices(motion, output.parent) if posed else ()
-    exported = images.undistorted(rig) if settings.undistort else rig
-    scenes = Scenes(motion, exported, mesh, image_of, times, time_offset, bodies)
-    output.mkdir(parents=True)
-    if set(formats) & _IMAGE_FORMATS:
-        with Frames.open(paths.frames) as frames:
-            names = images.name_images(frames, scenes)
-            if settings.images or settings.undistort:
-                images.write(output, frames, rig, scenes, names, formats)
-    for name in formats:
-        if name == "intercap":
-            (output / "intercap").mkdir()
-            parameters.write_intercap(output / "intercap" / "res.pkl", motion, about)
-        elif name == "amass":
-            parameters.write_amass(output / "amass", viewed, about)
-        elif name == "bop" and models.object_ is not None:
-            number = bop.object_id(models.object_.mesh)
-            bop.write(output / "bop", scenes, number, about, masks=settings.masks)
-        elif name == "coco":
-            coco.write(output / "coco" / "annotations.json", scenes, about, names)
-        elif name == "contact" and about.contact is not None and about.touching is not None:
-            contact.write(output / "contact", about.contact, about.touching)
-        elif name == "meshes":
-            viewed_from_master = zup_from_master if z_up else np.eye(4)
-            placed = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
-            meshes.write(
-                output / "meshes", viewed, placed, mesh, about,
-                kind=settings.mesh_format, every=settings.mesh_every,
+    object_ = models.object_ if motion.has_object else None
+    mesh = ObjectMesh.load(object_) if object_ is not None else None
+    requested = [formats()[name] for name in sorted(set(settings.formats))]
+    for format_ in requested:
+        format_.require_library()
+    written = [format_ for format_ in requested if mesh is not None or not format_.needs_object]
+    for format_ in requested:
+        if format_ not in written:
+            log.info(
+                "sequence %s: there is no object, so %s is not exported",
+                motion.sequence, format_.name,
             )  # fmt: skip
-        elif name == "glb":
-            (output / "glb").mkdir()
-            glb.write(output / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
+    draws_bodies = any(format_.draws_bodies for format_ in written)
+    bodies = body_vertices(motion, output.parent) if draws_bodies else ()
+    exported = images.undistorted(rig) if settings.undistort else rig
+    content = Content(
+        motion=motion,
+        zup_from_master=zup_from_master,
+        z_up=motion.moved(zup_from_master, z_up_name),
+        settings=settings,
+        about=_about(paths, motion, mesh),
+        scenes=Scenes(motion, exported, mesh, image_of, times, time_offset, bodies),
+        recorded=rig,
+        object_=object_,
+    )
+    output.mkdir(parents=True)
+    coordinates = {}
+    with contextlib.ExitStack() as stack:
+        if any(format_.reads_images for format_ in written):
+            frames = stack.enter_context(Frames.open(paths.frames))
+            names = images.name_images(frames, content.scenes)
+            content = replace(content, frames=frames, image_names=names)
+            if settings.images or settings.undistort:
+                images.write(output, frames, rig, content.scenes, names, [f.name for f in written])
+        for format_ in written:
+            coordinates[format_.name] = format_.write(output, content)
+    about = content.about
     files: dict[str, dict[str, str]] = {}
-    if set(formats) & _BODY_FORMATS:
+    if any(format_.holds_parameters for format_ in written):
         files = body_files.write(output / "body", about.body)
     if about.verdict.stated:
         summary = {"sequence": motion.sequence, **about.verdict.summary()}
         _dump(output / "verdict.json", summary)
-    text = readme(motion, viewed, mesh, requested, about, files, settings)
+    text = readme(content, requested, files)
     (output / "README.txt").write_text(text, encoding="utf-8")
-    coordinates = {
-        **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
-        "intercap": Coordinates.of(motion),
-        "bop": Coordinates.of(motion, bop.UNITS),
-        "coco": Coordinates.of(motion, coco.units(scenes)),
-        "glb": glb.coordinates(viewed, z_up=z_up),
-        "contact": Coordinates(_NO_FRAME, np.full(3, np.nan)),
-    }
-    _write_manifest(output, motion, formats, about, coordinates, files)
+    _write_manifest(output, motion, about, coordinates, files)
 
 
 def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:
@@ -162,7 +135,6 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
 def _write_manifest(
     output: Path,
     motion: Motion,
-    formats: Sequence[str],
     about: About,
     coordinates: Mapping[str, Coordinates],
     body: Mapping[str, Mapping[str, str]],
@@ -176,7 +148,7 @@ def _write_manifest(
         "gender": motion.gender,
         "frames": len(motion),
         "fps": motion.fps,
-        "formats": list(formats),
+        "formats": list(coordinates),
         "frame": {name: own.frame for name, own in coordinates.items()},
         "up": {name: own.to_json()["up"] for name, own in coordinates.items()},
         "up_axis": {name: own.up_axis for name, own in coordinates.items()},

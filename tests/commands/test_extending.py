@@ -13,7 +13,9 @@ import pytest
 from tests.helpers.extending import apply_chapter
 
 ROOT = Path(__file__).resolve().parents[2]
-CHAPTERS = ("A new keypoint layout", "A new converter")
+CHAPTERS = {"A new keypoint layout": 1, "A new converter": 1, "A new export format": 2}
+"""Number of the files, besides the test, that each chapter writes or edits."""
+FIXTURES = ("tests.output.conftest", "tests.output.export.conftest")
 
 
 @pytest.fixture(scope="module")
@@ -24,13 +26,17 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
     files = {title: apply_chapter(title, folder) for title in CHAPTERS}
     tests = [path for of in files.values() for path in of if path.name.startswith("test_")]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, tests)],
-        cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True,
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider",
+         *(word for name in FIXTURES for word in ("-p", name)), *map(str, tests)],
+        cwd=folder, env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
+        capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return {title: [path for path in of if path not in tests] for title, of in files.items()}
 
 
-@pytest.mark.parametrize("title", CHAPTERS)
-def test_another_detector_takes_one_file(title: str, files: dict[str, list[Path]]) -> None:
-    assert len(files[title]) == 1
+@pytest.mark.parametrize(("title", "count"), CHAPTERS.items())
+def test_a_chapter_takes_one_file_and_its_name_in_the_settings(
+    title: str, count: int, files: dict[str, list[Path]]
+) -> None:
+    assert len(files[title]) == count

@@ -282,10 +282,10 @@ def test_release_lists_and_verifies_its_files(
     assert str(project.path.parent) not in path.read_text()  # no folder of this machine
     assert set(content["inputs"]) >= {"sequences.tsv", "subjects.tsv", "objects.yaml"}
     assert check_release(project.results)
-    card = project.results / "card.md"
+    card = project.results / "README.md"
     text = card.read_text()
     assert "0 objects" in text and "The recordings are virtual" in text
     card.write_text(text + "more")
     assert not check_release(project.results)
-    assert "changed: card.md" in capsys.readouterr().out
+    assert "changed: README.md" in capsys.readouterr().out
     card.write_text(text)

@@ -432,13 +432,13 @@ def test_marks_are_newer_where_dates_are_whole_seconds(
     assert mark.stat().st_mtime_ns == plan.output(ONE, "joint").stat().st_mtime_ns + 10**9
 
 
-@pytest.mark.parametrize("target", ["nowhere", "card.md", "joint.h5"])
+@pytest.mark.parametrize("target", ["nowhere", "README.md", "joint.h5"])
 def test_an_output_that_is_a_link_to_nothing_is_missing(
     folder: Path, target: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Snakemake fails at a link to itself."""
     project = load_project(SETTINGS)
-    paths = (project.results / "card.md", project.artefact(ONE, "joint"))
+    paths = (project.results / "README.md", project.artefact(ONE, "joint"))
     for path in paths:
         path.unlink()
         path.symlink_to(target)

@@ -8,7 +8,7 @@ rule dataset:
         summary=f"{RESULTS}/summary.json",
         heatmaps=f"{RESULTS}/heatmaps.h5",
         tables=directory(f"{RESULTS}/tables"),
-        card=f"{RESULTS}/card.md",
+        card=f"{RESULTS}/README.md",
         card_json=f"{RESULTS}/card.json",
         croissant=f"{RESULTS}/croissant.json",
         export=directory(f"{RESULTS}/export"),

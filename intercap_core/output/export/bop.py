@@ -15,6 +15,7 @@ import trimesh
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
+from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.meshes import ply
 from intercap_core.output.export.motion import Coordinates
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
@@ -177,3 +178,49 @@ def model_info(mesh: ObjectMesh) -> dict[str, Any]:
 
 def _dump(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _write(folder: Path, content: Content) -> Coordinates:
+    assert content.object_ is not None
+    number = object_id(content.object_.mesh)
+    write(folder / "bop", content.scenes, number, content.about, masks=content.settings.masks)
+    return Coordinates.of(content.motion, UNITS)
+
+
+_README = """
+bop/                split "test": one scene per camera, in the order of lenses.json; lengths in
+    millimetres
+  images are numbered by frame set and have poses at the time of their exposure: a camera may have
+    slipped by whole sets or expose some milliseconds later; images of no frame are omitted
+  scene_gt.json: cam_R_m2c, cam_t_m2c = colour camera from model, row by row
+  scene_camera.json: world = {{ motion.frame }}; {{ up_of_master }}
+{% if undistorted %}
+  images, masks and boxes are undistorted: cam_K alone projects into them
+{% else %}
+  cam_K is a pinhole; images, masks and boxes are of the images as recorded, which are distorted,
+    see lenses.json (OpenCV's rational model); export.undistort resamples them
+{% endif %}
+  camera.json is the first camera's
+{% if images %}
+  depth/: of the pixels of rgb/, along the camera's axis, millimetres, 0 = unknown
+{% endif %}
+  mask/ the whole object, mask_visib/ without what the fitted body hides; no furniture is known
+  test_targets_bop19.json: images that show a tenth of the object or more
+  scene_about.json of a scene: the frame that each image shows, and why it is flagged
+  about.json: the body file, and the facts about each frame, below, in "by_frame"
+  models/: the mesh in millimetres, with its symmetries
+"""
+FORMATS = (
+    ExportFormat(
+        name="bop",
+        path="*/export/bop",
+        content="the object's poses, masks and lenses in BOP's format",
+        includes="*/export/bop/**/*.json",
+        media_type="application/json",
+        readme=_README,
+        write=_write,
+        needs_object=True,
+        reads_images=True,
+        draws_bodies=True,
+    ),
+)

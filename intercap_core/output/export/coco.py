@@ -12,6 +12,7 @@ import numpy as np
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.output.export.about import About
+from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion, posed_batches
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
@@ -137,3 +138,32 @@ def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> 
                 visibility = 2
         keypoints[k] = x, y, visibility
     return keypoints
+
+
+def _write(folder: Path, content: Content) -> Coordinates:
+    path = folder / "coco" / "annotations.json"
+    write(path, content.scenes, content.about, content.image_names)
+    return Coordinates.of(content.motion, units(content.scenes))
+
+
+_README = """
+coco/annotations.json  person and object in every image: visible masks, boxes, COCO's 17 keypoints
+  images are named <camera>/<frame set>, with the suffix of the recorded file, and are
+    {{ "undistorted" if undistorted else "those recorded, distortion included" }}
+  info: lenses by camera, the body file, and the facts about each frame, below; "frame" of an
+    image is its frame
+  keypoints: visibility 2 = visible, 1 = hidden by body or object, 0 = outside of the image
+"""
+FORMATS = (
+    ExportFormat(
+        name="coco",
+        path="*/export/coco/annotations.json",
+        content="masks, boxes and keypoints of person and object",
+        includes="*/export/coco/annotations.json",
+        media_type="application/json",
+        readme=_README,
+        write=_write,
+        reads_images=True,
+        draws_bodies=True,
+    ),
+)

@@ -17,14 +17,6 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.motion import Motion
 from intercap_core.schemas import CONTACT_M, JOINT, METRICS
 
-_DRAFT_HEADER = """\
-# Draft of the contact of {sequence}, as the joint stage states it: correct it, and copy it to
-# annotations/{sequence}.yaml. Frames are numbered from 0; an interval's end is the first frame
-# after it. Ends marked "uncertain" may be moved by the observed distance; remove the mark from ends
-# that you correct. The comment after an interval is its mean and least probability{annotated}.
-"""
-
-
 _UNCERTAIN: dict[tuple[bool, bool], Literal["start", "end", "both"] | None] = {
     (True, True): None,
     (False, True): "start",
@@ -173,53 +165,3 @@ class ContactVertices:
                 f"{name}_contact_vertices": surface.vertices.tolist(),
             }
         return entries
-
-
-def write(folder: Path, stated: StatedContact, touching: ContactVertices) -> None:
-    """Write contact.tsv, annotation_draft.yaml and contact_vertices.npz into the new ``folder``."""
-    folder.mkdir()
-    np.savez(
-        folder / "contact_vertices.npz",
-        allow_pickle=False,
-        **touching.to_arrays(),
-        frame=np.array("none: numbers of vertices, and signed distances"),
-        units=np.array("metres"),
-    )
-    (folder / "contact.tsv").write_text(table(stated), encoding="utf-8")
-    (folder / "annotation_draft.yaml").write_text(draft(stated), encoding="utf-8")
-
-
-def table(stated: StatedContact) -> str:
-    """Format as tab-separated text with a row per frame and region."""
-    labels = {1: "1", 0: "0", -1: ""}
-    rows = ["frame\tregion\tprobability\tannotated"]
-    for t, (probability, annotated) in enumerate(
-        zip(stated.probability, stated.annotated, strict=True)
-    ):
-        rows += [
-            f"{t}\t{region}\t{p:.4f}\t{labels[int(label)]}"
-            for region, p, label in zip(stated.regions, probability, annotated, strict=True)
-        ]
-    return "\n".join(rows) + "\n"
-
-
-def draft(stated: StatedContact) -> str:
-    """Format as an annotation file that the project can read."""
-    known = (stated.annotated >= 0).any()
-    header = _DRAFT_HEADER.format(
-        sequence=stated.sequence,
-        annotated=";\n# this sequence's annotation is part of the evidence" if known else "",
-    )
-    intervals = stated.intervals()
-    if not intervals:
-        return header + "# Nothing touches.\ncontact: []\n"
-    lines = []
-    for interval in intervals:
-        start, end = interval.start, interval.end
-        p = stated.probability[start:end, stated.regions.index(interval.part)]
-        doubt = f", uncertain: {interval.uncertain}" if interval.uncertain else ""
-        lines.append(
-            f"  - {{part: {interval.part}, start: {start}, end: {end}{doubt}}}"
-            f"  # {p.mean():.2f}, least {p.min():.2f}\n"
-        )
-    return header + "contact:\n" + "".join(lines)

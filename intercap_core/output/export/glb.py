@@ -20,6 +20,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.object_track.appearance import linear
 from intercap_core.output.export.about import About
+from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion, rest_pose
 
 _ARRAY, _ELEMENTS = 34962, 34963  # buffer targets, glTF 2.0 specification
@@ -240,3 +241,31 @@ def _linear(colours: np.ndarray) -> np.ndarray:
     values = linear(colours)
     values[:, 3] = colours[:, 3] / 255.0
     return values
+
+
+def _write(folder: Path, content: Content) -> Coordinates:
+    (folder / "glb").mkdir()
+    viewed, z_up = content.viewed, content.is_z_up
+    path = folder / "glb" / f"{viewed.sequence}.glb"
+    write(path, viewed, content.mesh, content.about, z_up=z_up)
+    return coordinates(viewed, z_up=z_up)
+
+
+_README = """
+glb/*.glb           skinned body (55 joints){{ " and object" if mesh }}, animated; metres, y up
+    as glTF requires
+  under the node "world": {{ viewed.frame }}; {{ up }}
+  four weights per vertex, first frame's expression, no pose correctives
+  asset.extras: the body file, and the facts about each frame, below; vertices keep their numbers
+"""
+FORMATS = (
+    ExportFormat(
+        name="glb",
+        path="*/export/glb",
+        content="animated body and object",
+        includes="*/export/glb/*.glb",
+        media_type="model/gltf-binary",
+        readme=_README,
+        write=_write,
+    ),
+)

@@ -69,9 +69,11 @@ def write(
         scene = scene_folder(folder / "bop", c)
         places = {"bop": scene / "rgb", "coco": folder / "coco" / camera.name}
         wanted = [place for name, place in places.items() if name in formats]
+        if not wanted:
+            return
         for place in wanted:
             place.mkdir(parents=True)
-        resampling = _Resampling(camera, exported.colour)
+        resampling = Resampling(camera, exported.colour)
         for image, name in names[c].items():
             file, *others = (place / name for place in wanted)
             if resampling.changes:
@@ -92,7 +94,7 @@ def write(
                 (scene / "depth" / f"{image:06d}.png").write_bytes(packet)
 
 
-class _Resampling:
+class Resampling:
     """Resampling of a camera's recorded images to the pixels of another colour lens.
 
     ``changes``: False if the lens is that of the recorded images.

@@ -9,8 +9,10 @@ from typing import Literal
 import numpy as np
 import trimesh
 
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
+from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion
 
 Kind = Literal["ply", "obj"]
@@ -79,3 +81,42 @@ def ply(mesh: trimesh.Trimesh, lines: Sequence[str]) -> bytes:
     first, rest = data.split(b"element vertex", 1)
     comments = "".join(f"comment {line}\n" for line in lines)
     return bytes(first + comments.encode("ascii", "replace") + b"element vertex" + rest)
+
+
+def _write(folder: Path, content: Content) -> Coordinates:
+    settings = content.settings
+    placed = (
+        apply(content.viewed_from_master, body)
+        for body in content.scenes.bodies[:: settings.mesh_every]
+    )
+    write(
+        folder / "meshes", content.viewed, placed, content.mesh, content.about,
+        kind=settings.mesh_format, every=settings.mesh_every,
+    )  # fmt: skip
+    return Coordinates.of(content.viewed)
+
+
+_README = """
+meshes/Mesh/*_second.{{ kind }}  body of a frame, named by its number
+{% if mesh %}
+meshes/Mesh/*_second_obj.{{ kind }}  the object
+{% endif %}
+  frame: {{ viewed.frame }}; {{ up }}
+  vertices in the order of the body file{{ " and of the object's mesh" if mesh }}
+{% if kind == "ply" and about.touching is not none %}
+  contact = 1 where they touch
+{% endif %}
+meshes/about.json   the body file, and the facts about each frame, below
+"""
+FORMATS = (
+    ExportFormat(
+        name="meshes",
+        path="*/export/meshes",
+        content="body and object of each frame as mesh files",
+        includes="*/export/meshes/Mesh/*",
+        media_type="application/octet-stream",
+        readme=_README,
+        write=_write,
+        draws_bodies=True,
+    ),
+)

@@ -132,15 +132,20 @@ def read_motion(
     )
 
 
-def rest_pose(model: BodyModel, parameters: BodyParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and joints (55, 3) of the first frame's shape in the T-pose."""
+def rest_body(model: BodyModel, parameters: BodyParameters) -> BodyOutput:
+    """Pose the body (batch 1) with the first frame's shape and expression in the T-pose."""
     rest = replace(
         model.zeros(1),
         betas=parameters.betas[:1].to(model.dtype),
         expression=parameters.expression[:1].to(model.dtype),
     )
     with torch.no_grad():
-        posed = model.forward(rest)
+        return model.forward(rest)
+
+
+def rest_pose(model: BodyModel, parameters: BodyParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) and joints (55, 3) of the first frame's shape in the T-pose."""
+    posed = rest_body(model, parameters)
     return posed.vertices[0].double().numpy(), posed.joints[0].double().numpy()
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.output.export.about import About
+from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion
 
 NUM_HAND_COMPONENTS = 12  # of a hand's pose in the InterCap release (SMPLify-X's default)
@@ -137,3 +138,64 @@ class _OldNamesPickler(pickle._Pickler):  # the C pickler offers no hook for nam
         old = module.replace("numpy._core.", "numpy.core.")
         self.write(pickle.GLOBAL + f"{old}\n{obj.__name__}\n".encode())  # type: ignore[attr-defined]
         self.memoize(obj)  # type: ignore[attr-defined]
+
+
+def _write_amass(folder: Path, content: Content) -> Coordinates:
+    write_amass(folder / "amass", content.viewed, content.about)
+    return Coordinates.of(content.viewed)
+
+
+def _write_intercap(folder: Path, content: Content) -> Coordinates:
+    (folder / "intercap").mkdir()
+    write_intercap(folder / "intercap" / "res.pkl", content.motion, content.about)
+    return Coordinates.of(content.motion)
+
+
+_AMASS_README = """
+amass/body.npz      AMASS keys (SMPL-X): poses (T,165) = root, body, jaw, eyes, hands; trans; betas
+  plus the body file, frame and units, and the facts about each frame, below
+{% if mesh %}
+amass/object.npz    rotation (T,3,3), translation (T,3): frame from object, metres
+{% endif %}
+  frame: {{ viewed.frame }}; {{ up }}
+  SMPL-X turns the body about its pelvis joint, not the origin; trans allows for that
+"""
+_INTERCAP_README = """
+intercap/res.pkl    pickle of numpy arrays and lists, keys and shapes as the InterCap release
+  plus "about": the body file, and the facts about each frame, below, in "by_frame"
+intercap/res.npz    the same as arrays
+  frame: {{ motion.frame }}; {{ up_of_master }}
+  global_orient, transl (T,3), body_pose (1,63T), betas and expression (T,10), jaw/leye/reye (T,3)
+  left_hand_pose, right_hand_pose (T,12): PCA coefficients over the mean hand
+    (flat_hand_mean=False), the nearest to the fitted pose
+  *_hand_pose_axis_angle (T,45): the fitted poses themselves, mean included
+{% if mesh %}
+  ob_pose, ob_trans: lists of T (3,) rotation vectors (radians) and translations (metres),
+    master camera from object
+{% else %}
+  ob_pose, ob_trans are omitted: there is no object
+{% endif %}
+  pose_embedding is omitted: it belongs to VPoser, which was not used
+"""
+FORMATS = (
+    ExportFormat(
+        name="amass",
+        path="*/export/amass/body.npz and object.npz",
+        content="AMASS keys",
+        includes="*/export/amass/*.npz",
+        media_type="application/octet-stream",
+        readme=_AMASS_README,
+        write=_write_amass,
+        holds_parameters=True,
+    ),
+    ExportFormat(
+        name="intercap",
+        path="*/export/intercap/res.pkl and res.npz",
+        content="as the InterCap release",
+        includes="*/export/intercap/*",
+        media_type="application/octet-stream",
+        readme=_INTERCAP_README,
+        write=_write_intercap,
+        holds_parameters=True,
+    ),
+)

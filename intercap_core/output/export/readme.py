@@ -8,32 +8,21 @@ from pathlib import Path
 import jinja2
 
 from intercap_core.body.maps import maps_path
-from intercap_core.config import ExportSettings
 from intercap_core.evaluation.verdict.figures import StatedError
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export.about import DEVIATIONS_SOURCE, About
-from intercap_core.output.export.motion import Coordinates, Motion
+from intercap_core.output.export.about import DEVIATIONS_SOURCE
+from intercap_core.output.export.format import Content, ExportFormat
+from intercap_core.output.export.motion import Coordinates
 from intercap_core.schemas import CONTACT_M
-
-NEED_OBJECT = ("bop", "contact")  # formats that describe an object only
 
 
 def readme(
-    motion: Motion,
-    viewed: Motion,
-    mesh: ObjectMesh | None,
-    formats: Sequence[str],
-    about: About,
-    files: Mapping[str, Mapping[str, str]],
-    settings: ExportSettings,
+    content: Content, requested: Sequence[ExportFormat], files: Mapping[str, Mapping[str, str]]
 ) -> str:
     """Compose README.txt.
 
     Args:
-        motion: the motion in the master camera's frame.
-        viewed: the motion in the frame of amass, glb and meshes.
-        mesh: None without an object; the formats that need one are then omitted.
-        formats: formats that the settings list.
+        requested: formats that the settings list; without an object, those that need one are
+            stated as omitted.
         files: written body files, from :func:`.body_files.write`.
     """
     environment = jinja2.Environment(
@@ -44,20 +33,30 @@ def readme(
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    settings, about = content.settings, content.about
+    variables = {
+        "motion": content.motion,
+        "viewed": content.viewed,
+        "mesh": content.mesh,
+        "about": about,
+        "kind": settings.mesh_format,
+        "images": settings.images or settings.undistort,
+        "undistorted": settings.undistort,
+        "up": Coordinates.of(content.viewed).header_lines()[1],
+        "up_of_master": Coordinates.of(content.motion).header_lines()[1],
+    }
+    sections = [
+        f"\n{format_.name} is omitted, although export.formats lists it: there is no object.\n"
+        if format_.needs_object and content.mesh is None
+        else environment.from_string(format_.readme).render(variables)
+        for format_ in requested
+    ]
     return environment.get_template("readme.txt.j2").render(
-        motion=motion,
-        viewed=viewed,
-        mesh=mesh,
-        formats=formats,
-        about=about,
+        variables,
+        sections="".join(sections),
         files=files,
-        kind=settings.mesh_format,
-        images=settings.images or settings.undistort,
-        undistorted=settings.undistort,
         body_file=f"{about.body.path.name}, digest {about.body.to_json()['body_file_digest']}",
         stated_errors=_stated_errors(about.verdict.stated),
-        up=Coordinates.of(viewed).header_lines()[1],
-        up_of_master=Coordinates.of(motion).header_lines()[1],
         contact_mm=1e3 * CONTACT_M,
         deviations_source=DEVIATIONS_SOURCE,
         maps={name: maps_path(Path(name)).name for name in files},

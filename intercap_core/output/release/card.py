@@ -27,6 +27,8 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.flags import PARTS
+from intercap_core.output.export.registry import formats as export_formats
+from intercap_core.output.release.datasheet import statements
 from intercap_core.output.site.measures import covered
 from intercap_core.versions import versions
 
@@ -35,6 +37,7 @@ Facts = dict[str, Any]
 _TEMPLATES = Path(__file__).parent / "data"
 _NUMBER = re.compile(r"\d+(\.\d+)?")  # replaced in reasons, which are counted without numbers
 _MARKUP = re.compile(r"[\\`*\[\]!]")  # characters that begin markup within a line of Markdown
+_HUB_LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]*")  # identifiers of licences on hubs
 _MAX_REASONS = 12  # most frequent reasons of flags
 # Size categories of dataset hubs: upper limit in frames, name
 _SIZES = (
@@ -57,16 +60,9 @@ CONVENTIONS = {
     "errors": "estimated without ground truth, by cameras held out; the factor gives a range that "
     "contains most true errors",
 }
-FORMATS = {
-    "intercap": "*/export/intercap/res.pkl and res.npz: as the InterCap release",
-    "amass": "*/export/amass/body.npz and object.npz: AMASS keys",
-    "bop": "*/export/bop: the object's poses, masks and lenses in BOP's format",
-    "coco": "*/export/coco/annotations.json: masks, boxes and keypoints of person and object",
-    "bop_merged": "export/bop: bop of all sequences as one dataset with the split test",
-    "coco_merged": "export/coco/annotations.json: coco of all sequences as one file",
-    "glb": "*/export/glb: animated body and object",
-    "contact": "*/export/contact: contact by frame and region, and the vertices that touch",
-    "meshes": "*/export/meshes: body and object of each frame as mesh files",
+MERGED_FORMATS = {  # files and content of the exports of all sequences as one
+    "bop": ("export/bop", "bop of all sequences as one dataset with the split test"),
+    "coco": ("export/coco/annotations.json", "coco of all sequences as one file"),
 }
 
 
@@ -89,6 +85,7 @@ def facts(
     measured = [s.metrics for s in summaries]
     frames = sum(len(s) for s in measured)
     by_subject, by_object = _splits(measured, settings)
+    virtual = all(s.has_truth for s in measured)
     return {
         "name": dataset,
         "title": settings.title or dataset,
@@ -99,7 +96,8 @@ def facts(
         "url": settings.url,
         "citation": settings.citation,
         "published": settings.published.isoformat() if settings.published else "",
-        "virtual": all(s.has_truth for s in measured),
+        "virtual": virtual,
+        "statements": statements(settings, virtual=virtual),
         "counts": {
             "sequences": len(measured),
             "frames": frames,
@@ -117,12 +115,26 @@ def facts(
         "bodies": _bodies(summaries),
         "splits": {"subject": _split_to_json(by_subject, measured, "subject"),
                    "object": _split_to_json(by_object, measured, "object_")},
-        "formats": {name: what for name, what in FORMATS.items()
-                    if name.removesuffix("_merged") in formats},
+        "formats": _formats(formats),
         "conventions": CONVENTIONS,
         "stages": _stages(summaries),
         "software": dict(versions()),
     }  # fmt: skip
+
+
+def _formats(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return files and content of exported formats, and of merged ones, by name."""
+    described = {
+        name: {"path": format_.path, "content": format_.content}
+        for name, format_ in export_formats().items()
+        if name in names
+    }
+    merged = {
+        f"{name}_merged": {"path": path, "content": content}
+        for name, (path, content) in MERGED_FORMATS.items()
+        if name in names
+    }
+    return described | merged
 
 
 def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) -> pd.DataFrame:
@@ -157,7 +169,11 @@ def markdown(card: Facts) -> str:
     environment.filters["plain"] = _escape
     frames = card["counts"]["frames"]
     size = next((name for most, name in _SIZES if frames < most), "n>10M")
-    return environment.get_template("card.md.j2").render(card=card, size=size)
+    licence = card["licence"].lower()
+    hub_licence = licence if _HUB_LICENCE.fullmatch(licence) else ""
+    return environment.get_template("card.md.j2").render(
+        card=card, size=size, hub_licence=hub_licence
+    )
 
 
 def _escape(text: str) -> str:

@@ -1,4 +1,6 @@
-"""Description of the dataset in the Croissant format 1.0 (mlcommons.org/croissant).
+"""Description of the dataset in the Croissant format 1.0, with its responsible-AI fields.
+
+Croissant: mlcommons.org/croissant.
 
 It lists files and columns of tables for loaders and search engines.
 """
@@ -12,9 +14,11 @@ from typing import Any
 
 import pandas as pd
 
+from intercap_core.output.export.registry import formats
 from intercap_core.output.release.card import Facts
+from intercap_core.output.release.datasheet import rai_fields
 
-CONFORMS_TO = "http://mlcommons.org/croissant/1.0"
+CONFORMS_TO = ["http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0"]
 _TEXT = "sc:Text"
 _TERMS = (
     "citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format",
@@ -36,16 +40,9 @@ _CONTEXT = {
     "examples": {"@id": "cr:examples", "@type": "@json"},
     **{name: f"cr:{name}" for name in _TERMS},
 }
-_FILES = {  # glob pattern and media type of each export format
-    "intercap": ("*/export/intercap/*", "application/octet-stream"),
-    "amass": ("*/export/amass/*.npz", "application/octet-stream"),
-    "bop": ("*/export/bop/**/*.json", "application/json"),
-    "coco": ("*/export/coco/annotations.json", "application/json"),
-    "bop_merged": ("export/bop/**/*.json", "application/json"),
-    "coco_merged": ("export/coco/annotations.json", "application/json"),
-    "glb": ("*/export/glb/*.glb", "model/gltf-binary"),
-    "contact": ("*/export/contact/*.tsv", "text/tab-separated-values"),
-    "meshes": ("*/export/meshes/Mesh/*", "application/octet-stream"),
+_MERGED_FILES = {  # glob of the merged exports, whose media type is that of the format
+    "bop": "export/bop/**/*.json",
+    "coco": "export/coco/annotations.json",
 }
 
 
@@ -73,7 +70,8 @@ def croissant(card: Facts, folder: Path, tables: Mapping[str, pd.DataFrame]) -> 
         "datePublished": card["published"],
         "creator": [{"@type": "sc:Person", "name": name} for name in card["creators"]],
     }
-    return described | {key: value for key, value in optional.items() if value}
+    stated = {key: value for key, value in optional.items() if value}
+    return described | stated | rai_fields(card)
 
 
 def _table_file(folder: Path, name: str) -> dict[str, Any]:
@@ -91,13 +89,14 @@ def _table_file(folder: Path, name: str) -> dict[str, Any]:
 
 
 def _file_set(name: str) -> dict[str, Any]:
-    includes, media_type = _FILES[name]
+    format_ = formats()[name.removesuffix("_merged")]
+    is_merged = name.endswith("_merged")
     return {
         "@type": "cr:FileSet",
         "@id": name,
         "name": name,
-        "encodingFormat": media_type,
-        "includes": includes,
+        "encodingFormat": format_.media_type,
+        "includes": _MERGED_FILES[format_.name] if is_merged else format_.includes,
     }
 
 

@@ -96,7 +96,7 @@ def test_report_names_the_other_program(imported, tmp_path):
     page = (out / "site" / "sequences" / NAME / "index.html").read_text()
     assert "1 with imported results" in overview
     assert "made by another program: res.pkl" in page and "energy of each term" not in page
-    assert "1 sequences have imported results" in (out / "card.md").read_text()
+    assert "1 sequences have imported results" in (out / "README.md").read_text()
 
 
 def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):

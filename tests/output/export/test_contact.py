@@ -8,7 +8,8 @@ import yaml
 
 from intercap_core.annotation import Annotation
 from intercap_core.joint.contact.annotated import annotation_evidence
-from intercap_core.output.export.contact import StatedContact, draft, table
+from intercap_core.output.export.contact import StatedContact
+from intercap_core.output.export.contact_files import draft, table
 from intercap_core.schemas import CONTACT_REGIONS
 
 

@@ -81,7 +81,7 @@ def test_splits_are_in_a_table(folder: Path) -> None:
 
 
 def test_markdown_has_a_head_that_hubs_read(folder: Path) -> None:
-    text = (folder / "card.md").read_text()
+    text = (folder / "README.md").read_text()
     _, head, body = text.split("---\n", 2)
     header = yaml.safe_load(head)
     assert header["pretty_name"] == CARD.title and header["license"] == "cc-by-4.0"
@@ -111,7 +111,7 @@ def test_without_a_licence_the_card_says_so(
 ) -> None:
     summaries = {path.stem: path for path in (folder / "summaries").iterdir()}
     merge(summaries, captures, tmp_path, "things")
-    text = (tmp_path / "card.md").read_text()
+    text = (tmp_path / "README.md").read_text()
     assert "licence | **not stated" in text and "license: other" in text
     assert "license" not in json.loads((tmp_path / "croissant.json").read_text())
 

@@ -13,7 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.output.release import manifest
 
 FILES = {
-    "card.md": "card", "card.json": "card", "summary.json": "card", "heatmaps.h5": "card",
+    "README.md": "card", "card.json": "card", "summary.json": "card", "heatmaps.h5": "card",
     "tables/frames.csv": "tables", "site/index.html": "site",
     "site/sequences/s01/index.html": "site", "site/sequences/s02/index.html": "site",
     "s01/export/amass/body.npz": "export", "s01/joint.h5": "artefact",
@@ -55,13 +55,13 @@ def test_sha256sum_reads_the_list(folder: Path) -> None:
 
 def test_differences_are_classified(folder: Path) -> None:
     manifest.write(folder, {}, kinds=("card", "tables", "artefact"))
-    (folder / "card.md").unlink()
+    (folder / "README.md").unlink()
     changed = folder / "s02" / "joint.h5"
     changed.write_bytes(changed.read_bytes()[:-1] + b"x")  # of the same size
     (folder / "tables" / "new.csv").write_text("")
     (folder / "site" / "new.html").write_text("")  # of a kind that was not released
     _, differences = manifest.check(folder)
-    assert differences == manifest.Differences(["card.md"], ["s02/joint.h5"], ["tables/new.csv"])
+    assert differences == manifest.Differences(["README.md"], ["s02/joint.h5"], ["tables/new.csv"])
     assert differences
 
 
