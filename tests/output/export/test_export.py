@@ -10,7 +10,7 @@ import pickletools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.loading import OPEN_BODY
+from intercap_core.config import ExportSettings
 from intercap_core.entries import Symmetry
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.masks import decode
@@ -28,13 +29,26 @@ from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export import bop, coco
 from intercap_core.output.export.about import ExportBody
 from intercap_core.output.export.motion import read_motion, z_up_frame
+from intercap_core.output.export.registry import formats
 from intercap_core.output.export.silhouettes import Scenes
 from intercap_core.schemas import METRICS
+from intercap_core.stage_list import STAGES
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
 
 OFFSET = np.array([0, fitted.BODY_OFFSET_M, 0])
 OBJECT_OFFSET = np.array([0, fitted.OBJECT_OFFSET_M / 2, 0])
+
+
+README = Path(__file__).resolve().parents[3] / "README.md"
+
+
+def test_settings_help_and_readme_list_all_formats() -> None:
+    (tuple_, *_) = get_args(ExportSettings.model_fields["formats"].annotation)
+    assert set(get_args(tuple_)) == set(formats())
+    table = README.read_text(encoding="utf-8").split("\n## Formats\n")[1].split("\n## ")[0]
+    for name in formats():
+        assert f"`{name}`" in table and name in STAGES["export"].purpose, name
 
 
 def test_moving_a_motion_forth_and_back(capture: fitted.Capture) -> None:
