@@ -177,7 +177,7 @@ def _intermimic(resampled: Resampled, joints: np.ndarray, content: Content) -> t
     tensor[:, _POSITIONS] = joints[:, order].reshape(len(joints), -1)
     tensor[:, _OBJECT] = poses[:, [4, 5, 6, 1, 2, 3, 0]]  # x, y, z, qx, qy, qz, qw
     if content.about.contact is not None:
-        touching = (content.about.contact.probability >= 0.5).any(axis=1)
+        touching = np.any(content.about.contact.probability >= 0.5, axis=1)
         tensor[:, _OBJECT_CONTACT] = touching[np.rint(resampled.source_frame).astype(int)]
     return torch.as_tensor(tensor)
 

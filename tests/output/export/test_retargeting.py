@@ -27,7 +27,7 @@ DOCS = Path(__file__).resolve().parents[3] / "docs" / "exports.md"
 SMPLH_PLACES = {
     0: "pelvis", 4: "left_foot", 5: "right_hip", 9: "spine1", 13: "head", 14: "left_collar",
     17: "left_wrist", 18: "left_index1", 24: "left_pinky1", 32: "left_thumb3", 36: "right_wrist",
-    45: "right_ring1", 51: "right_thumb3",
+    46: "right_ring1", 51: "right_thumb3",
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from tests.helpers import fitted_capture as fitted
 from tests.helpers.site import merge, write_summaries
 
 CARD = CardSettings(
+    citation="@misc{things}",
+    published=datetime.date(2026, 3, 1),
     licence="CC-BY-4.0",
     collection="Recorded in a gym.",
     consent="Written consent; ethics board 12/2026.",
