@@ -74,6 +74,10 @@ class ScanErrors:
     """Why there is no scan."""
     tracks: Sequence[TrackErrors] = field(default_factory=list)
     """Errors in other recordings of the object, tracked with both meshes."""
+    way: str = "turned"
+    """How the recording was scanned."""
+    before: float = float("nan")
+    """Chamfer distance of the mesh that was improved, metres; NaN = none."""
 
     @property
     def chamfer(self) -> float:
@@ -189,8 +193,8 @@ def _plane_step(points: np.ndarray, goals: np.ndarray, normals: np.ndarray) -> n
 
 
 def figures(scans: Sequence[ScanErrors]) -> dict[str, float]:
-    """Mean errors over objects, millimetres; shares; error of tracks with scanned meshes over that
-    with given ones, geometric mean over recordings."""
+    """Mean errors over objects, millimetres, of the scan and of the mesh before it; shares; error
+    of tracks with scanned meshes over that with given ones, geometric mean over recordings."""
     if not scans:
         return {}
     solved = [scan for scan in scans if len(scan.to_truth)]
@@ -201,6 +205,9 @@ def figures(scans: Sequence[ScanErrors]) -> dict[str, float]:
     if solved:
         found["chamfer_mm"] = 1e3 * float(np.mean([scan.chamfer for scan in solved]))
         found["p95_mm"] = 1e3 * float(np.mean([scan.p95 for scan in solved]))
+        before = [scan.before for scan in solved if np.isfinite(scan.before)]
+        if before:
+            found["before_mm"] = 1e3 * float(np.mean(before))
     ratios = [
         np.median(track.scanned) / np.median(track.given) for s in solved for track in s.tracks
     ]

@@ -1,4 +1,4 @@
-"""`intercap scan`: its refusals before any work, and the entry of objects.yaml."""
+"""`intercap scan`: refusals before any work, the entry of objects.yaml, and scans of a ball."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 from intercap_core.scan.proposal import propose_symmetry
 from intercap_core.scan.result import ScannedMesh
+from tests.helpers.fitted_capture import Capture, shared_capture, write_project
+from tests.helpers.manifests import rewrite_manifests
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -73,3 +75,36 @@ def test_a_new_object_is_added_to_the_users_file(project: Project) -> None:
     before = file.read_text()
     add_entry(load_project(project.path), "kettle", [], mesh, path)  # the user's entry stays
     assert file.read_text() == before
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return shared_capture(tmp_path_factory)
+
+
+def _radius(points: np.ndarray) -> float:
+    """Radius of the sphere of least squares through points (N, 3)."""
+    design = np.column_stack([2 * points, np.ones(len(points))])
+    solution = np.linalg.lstsq(design, (points**2).sum(1), rcond=None)[0]
+    return float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
+
+
+@pytest.mark.parametrize("improve", [False, True])
+def test_a_ball_that_nobody_moves(tmp_path: Path, capture: Capture, improve: bool) -> None:
+    """Three cameras around a person whose palm is at the ball, which keeps its place."""
+    settings = write_project(tmp_path, capture, "cap")
+    project = load_project(settings)
+    true = float(np.abs(capture.mesh.vertices[:, 0]).max())
+    name = "globe"
+    if improve:
+        name = "football"
+        cube = trimesh.creation.box((1.6 * true,) * 3)
+        rough = tmp_path / "rough.ply"
+        rough.write_bytes(cube.export(file_type="ply"))
+        (tmp_path / "objects.yaml").write_text(f"{name}: {{mesh: {rough}}}\n")
+        project = load_project(settings)
+    rewrite_manifests(project)
+    mesh, path, page = scan(project, name, ["cap"], labels=["sports ball"], improve=improve)
+    assert path.is_file() and page.is_file() and mesh.watertight
+    assert _radius(mesh.vertices[mesh.measured]) == pytest.approx(true, abs=0.004)
+    assert (name in load_project(settings).objects) and mesh.turned_deg < 1e-6

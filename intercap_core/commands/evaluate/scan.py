@@ -1,13 +1,14 @@
 """Part ``scan`` of `intercap dev evaluate`: meshes by `intercap scan` compared with the true ones.
 
-Recordings with a script whose name ends in ``_scan`` are scanned. In the other recordings of a
-scanned object, it is tracked twice: with the mesh of objects.yaml and with the scanned one. If both
-have the same seed, the true objects are equal.
+The script decides how a recording is scanned (``WAYS``). In the other recordings of an object that
+a person turned, it is tracked twice: with the mesh of objects.yaml and with the scanned one. If
+both have the same seed, the true objects are equal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,27 +43,43 @@ from intercap_core.project import Project
 from intercap_core.schemas import TRUTH
 from intercap_core.stages import object_track
 
-AREA, SCRIPTS = "scan", "_scan"
+AREA = "scan"
+# How a recording is scanned, by the end of its script's name
+TURNED, STILL, IMPROVED = "turned", "still", "improved"
+WAYS = {"_scan": TURNED, "_still": STILL, "_carry": IMPROVED}
 
 
-def is_scanned(project: Project, sequence: str) -> bool:
-    """Whether the object of a recording is scanned."""
-    return project.captures[sequence].interaction.endswith(SCRIPTS)
+def way_of(project: Project, sequence: str) -> str:
+    """How a recording is scanned; "" = it is not."""
+    script = project.captures[sequence].interaction
+    return next((way for end, way in WAYS.items() if script.endswith(end)), "")
 
 
 def measure(project: Project, sequence: str) -> ScanErrors:
-    """Scan the object of one recording, and track it in its other recordings."""
-    entry = project.object_of(sequence)
-    assert entry is not None  # a script that turns an object
+    """Scan the object of one recording, and track a turned object in its other recordings."""
+    entry, way = project.object_of(sequence), way_of(project, sequence)
+    assert entry is not None  # a script with an object
     path = project.results / "scans" / f"{sequence}.ply"
     path.parent.mkdir(exist_ok=True)
-    try:
-        found, *_ = scan(project, entry.name, [sequence], output=path, replace=True)
-    except UserError as error:
-        nothing = np.zeros(0)
-        return ScanErrors(sequence, entry.name, nothing, nothing, problem=str(error))
     with artefacts.read(truth_of(project, sequence), TRUTH) as true:
         truth = Mesh(true["object_vertices"].astype(np.float64), true["object_faces"])
+    before = float("nan")
+    if way == IMPROVED:
+        mesh = ObjectMesh.load(entry)
+        hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
+        rough = path.with_name(f"{sequence}_before.ply")
+        hull.export(rough)
+        entry = entry.model_copy(update={"mesh": rough, "contact_vertices": None})
+        project = replace(project, objects=project.objects | {entry.name: entry})
+        given = Mesh(np.asarray(hull.vertices), np.asarray(hull.faces))
+        before = float(np.mean(distances(given, truth)))
+    try:
+        found, *_ = scan(
+            project, entry.name, [sequence], output=path, improve=way == IMPROVED, replace=True
+        )
+    except UserError as error:
+        nothing = np.zeros(0)
+        return ScanErrors(sequence, entry.name, nothing, nothing, problem=str(error), way=way)
     scanned = Mesh(found.vertices, found.faces)
     aligned = scanned.moved(align(scanned, truth))
     in_true_frame = path.with_name(f"{sequence}_aligned.ply")
@@ -70,11 +87,14 @@ def measure(project: Project, sequence: str) -> ScanErrors:
     tracks = [
         _track_errors(project, other, entry, in_true_frame)
         for other, row in project.sequences.items()
-        if row.object == entry.name and not is_scanned(project, other)
+        if way == TURNED
+        and row.object == entry.name
+        and way_of(project, other) not in (TURNED, STILL)
     ]
     return ScanErrors(
-        sequence, entry.name, *distances(aligned, truth), scanned.is_watertight, tracks=tracks
-    )
+        sequence, entry.name, *distances(aligned, truth), scanned.is_watertight, tracks=tracks,
+        way=way, before=before,
+    )  # fmt: skip
 
 
 def _track_errors(
@@ -110,10 +130,15 @@ def by_object(errors: Sequence[ScanErrors]) -> dict[str, list[ScanErrors]]:
 
 
 def flat(evaluations: Sequence[Scans]) -> Figures:
-    """Keys ``scan.<measure>`` and ``scan.<object>.<measure>``."""
+    """Keys ``scan.<measure>`` and ``scan.<object>.<measure>`` of objects that a person turned, and
+    ``scan.<way>.<measure>`` of the others."""
     errors = [error for found in evaluations for error in found.errors]
-    result = keyed(f"{AREA}.", with_spread(figures, errors))
-    for name, some in by_object(errors).items():
+    result: Figures = {}
+    for way in dict.fromkeys([TURNED, *(error.way for error in errors)]):
+        some = [error for error in errors if error.way == way]
+        prefix = f"{AREA}." if way == TURNED else f"{AREA}.{way}."
+        result |= keyed(prefix, with_spread(figures, some))
+    for name, some in by_object([e for e in errors if e.way == TURNED]).items():
         result |= keyed(f"{AREA}.{name}.", with_spread(figures, some))
     return result
 
@@ -122,14 +147,17 @@ def print_scans(evaluations: Sequence[Scans]) -> None:
     """Print a table with a row per scan."""
     console = standard_console()
     table = ListTable(
-        "object", "chamfer mm", "p95 mm", "watertight", "track ratio", "", title="scanned meshes"
-    )
+        "object", "way", "before mm", "chamfer mm", "p95 mm", "watertight", "track ratio", "",
+        title="scanned meshes",
+    )  # fmt: skip
     for found in evaluations:
         for error in sorted(found.errors, key=lambda e: e.object_):
             values = figures([error])
             closed = "yes" if error.watertight else "no"
             table.add_row(
                 error.object_,
+                error.way,
+                number(values.get("before_mm"), 2),
                 number(values.get("chamfer_mm"), 2),
                 number(values.get("p95_mm"), 2),
                 closed if len(error.to_truth) else "",
@@ -147,5 +175,5 @@ PART = EvaluationPart(
     measure=measure,
     flat=flat,
     print_tables=print_scans,
-    has=is_scanned,
+    has=lambda project, sequence: bool(way_of(project, sequence)),
 )

@@ -13,7 +13,7 @@ from intercap_core.studio.interactions.base import Interaction
 from intercap_core.studio.interactions.carrying import HandleCarry
 from intercap_core.studio.interactions.drinking import Drinking
 from intercap_core.studio.interactions.football_kick import FootballKick
-from intercap_core.studio.interactions.presenting import Checking, PassingOn, Turning
+from intercap_core.studio.interactions.presenting import Checking, LookingOn, PassingOn, Turning
 from intercap_core.studio.interactions.sitting import ChairSit, StoolSit
 from intercap_core.studio.interactions.skateboard_ride import SkateboardRide
 from intercap_core.studio.interactions.slipping import GlidingSwing, Regrasp, TurningSwing
@@ -134,6 +134,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
         plinth_ahead_m=0.26, palms_m=(-0.05, 0.0, 0.055),
     ),
     "toolbox_scan": _script(Turning, "toolbox", **BETWEEN_PALMS, top_of_height=0.42),
+    "toolbox_still": _script(LookingOn, "toolbox"),
     "football_scan": _script(Turning, "football", **BETWEEN_PALMS),
     "skateboard_scan": _script(  # the palms are at its ends
         Turning, "skateboard", **BETWEEN_PALMS | TIPPED, top_of_height=0.35,

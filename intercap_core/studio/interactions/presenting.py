@@ -113,6 +113,28 @@ class Turning(Checking):
         return 0.3 * plateau(times, 0.8, 1.1, 2.3, 2.65)
 
 
+class LookingOn(HandlingScript):
+    """Step to an object on a plinth, lean forward and look at it without touching it."""
+
+    highlight = 1.7
+    top_of_height = 0.42
+    aside = 0.0
+
+    def plan(self) -> None:
+        self.set_out(self.top_of_height, self.aside)
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        look = plateau(times, 0.8, 1.3, 2.0, 2.6)
+        return self.leaning(times, 0.3 * look, 0.3 * look)
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+        """At rest."""
+        return WristPose.still(self.pick_pose, len(times))
+
+    def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
+        return self.path(world, pelvis, times).matrices
+
+
 class PassingOn(HandlingScript):
     """Carry an object from one plinth to a second one on the left, and hold it out meanwhile."""
 
