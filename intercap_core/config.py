@@ -353,6 +353,8 @@ class StudioCapture(Model):
     """plain = as thin as skin; heavy = soles of 22 mm, 10 to 15 mm around the feet."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"
     """Colours of the object: of its mesh, one plain colour, or a print unknown to the mesh."""
+    camera: Literal["rig", "hand_held"] = "rig"
+    """hand_held = nobody is in view, and one camera is carried around the object at rest."""
     layout: LayoutName = "k4a"
     """Layout of the recordings, as in the table of sequences."""
     depth: bool = True

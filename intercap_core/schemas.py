@@ -491,6 +491,24 @@ TRUTH = Schema(
     },
 )  # fmt: skip
 
+HAND_HELD_TRUTH = Schema(
+    name="hand_held_truth",
+    version=1,
+    stage="studio",
+    frame="object",
+    attributes={
+        "sequence": "sequence name",
+        "interaction": "script whose object stands in the room",
+        "object": "object name",
+    },
+    fields={
+        "times": Field(("T",), "float64", "time of each frame set since the first one", "s"),
+        "object_vertices": Field(("Vo", "3"), "float32", "vertices of the true object's mesh", "m", "object"),
+        "object_faces": Field(("Fo", "3"), "int32", "faces of the true object's mesh"),
+        "object_from_colour": Field(("T", "4", "4"), "float64", "true pose of the camera that is carried around the object", "m", "object"),
+    },
+)  # fmt: skip
+
 _PER_STAGE_TRUTH = {
     f"truth/{stage}/{key}": Field(dims, dtype, doc, units, optional=True)
     for stage in ("object_track", "body_fit", "joint")

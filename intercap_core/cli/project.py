@@ -213,27 +213,35 @@ def scan(
             "--improve", help="Improve the mesh of objects.yaml by the tracked sequences."
         ),
     ] = False,
+    hand_held: Annotated[
+        bool,
+        typer.Option(
+            "--hand-held", help="One camera is carried around the object, which rests on a table."
+        ),
+    ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Overwrite an existing mesh.")] = False,
 ) -> None:
     """Make a closed, coloured mesh of an object from recordings with depth.
 
     A person picks the object up and turns it so that every side faces the cameras, also its
     underside; several recordings with different grips may be joined. Hands and furniture are left
-    out. An object that only stands before the cameras is scanned too, with a flat underside. Writes
-    the mesh, an entry of objects.yaml with a proposed symmetry, and a page with pictures. Nothing
-    is written if a quarter of the surface was never measured; the message names what to record
-    instead.
+    out. An object that only stands before the cameras is scanned too, with a flat underside. With
+    --hand-held, one depth camera is carried once around an object on a table or on the floor; its
+    pose in the calibration is not used, and no keypoints are needed. Writes the mesh, an entry of
+    objects.yaml with a proposed symmetry, and a page with pictures. Nothing is written if a quarter
+    of the surface was never measured; the message names what to record instead.
 
     Examples: intercap scan lab/config.yaml kettle turn_kettle_01 --label bottle;
     intercap scan lab/config.yaml kettle turn_kettle_01 turn_kettle_02 --replace;
-    intercap scan lab/config.yaml kettle drink_01 --improve --output kettle_better.ply
+    intercap scan lab/config.yaml kettle drink_01 --improve --output kettle_better.ply;
+    intercap scan lab/config.yaml kettle around_kettle_01 --hand-held
     """
     project = open_project(settings)
     from intercap_core.commands.scan import scan as run_scan
 
     _, path, page = run_scan(
         project, name, sequences, output=output, labels=label or [], improve=improve,
-        replace=replace,
+        hand_held=hand_held, replace=replace,
     )  # fmt: skip
     typer.echo(f"written: {path}\npictures and figures: {page}")
 

@@ -31,7 +31,7 @@ from intercap_core.formats.recordings.source import (
 from intercap_core.geometry.camera.rig import Rig, count_facing_away
 from intercap_core.inputs.files import describe_unread, list_files, name_some
 from intercap_core.project import Project
-from intercap_core.schemas import TRUTH
+from intercap_core.schemas import HAND_HELD_TRUTH, TRUTH
 
 # Length of a recording as a share of the other cameras' or of the length that its header states.
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
@@ -403,11 +403,14 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingCheck:
 
 def faults_of_truth(path: Path) -> list[str]:
     """Error message if a file in the column truth is no truth file; [] otherwise."""
-    try:
-        with artefacts.read(path, TRUTH):
-            return []
-    except UserError as error:
-        return [f"column truth names a file without truth: {error}"]
+    problem = ""
+    for schema in (HAND_HELD_TRUTH, TRUTH):
+        try:
+            with artefacts.read(path, schema):
+                return []
+        except UserError as error:
+            problem = f"column truth names a file without truth: {error}"
+    return [problem]
 
 
 def _parse(value: bytes) -> int | str | None:

@@ -1,4 +1,5 @@
-"""`intercap scan`: mesh of an object from recordings of a person who turns it."""
+"""`intercap scan`: mesh of an object from recordings of a person who turns it, or of a walk around
+it."""
 
 from __future__ import annotations
 
@@ -28,8 +29,10 @@ from intercap_core.scan.alignment import track_from
 from intercap_core.scan.fusion import Posed, fuse
 from intercap_core.scan.handled import Chain, cloud_of, find_handled, is_still, slowest
 from intercap_core.scan.result import ScannedMesh, finish, simplified
+from intercap_core.scan.standing import ON_PLANE_M, find_standing, posed
 from intercap_core.scan.surfaces import Recording
 from intercap_core.scan.volume import ClosedSurface
+from intercap_core.scan.walk import HandHeld, camera_moves, follow
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK
 from intercap_core.stages import object_track
 
@@ -51,6 +54,7 @@ def scan(
     output: Path | None = None,
     labels: Sequence[str] = (),
     improve: bool = False,
+    hand_held: bool = False,
     replace: bool = False,
 ) -> tuple[ScannedMesh, Path, Path]:
     """Scan an object; write its mesh, its entry in objects.yaml and a page, and print a summary.
@@ -64,6 +68,7 @@ def scan(
         output: file of the mesh; default: objects/NAME.ply next to the settings.
         labels: detector classes of the object; default: those of objects.yaml, or any.
         improve: the poses are those of the object's mesh in objects.yaml, whose frame is kept.
+        hand_held: the recording is of one camera that is carried around the object at rest.
         replace: overwrite an existing file.
     """
     for sequence in sequences:
@@ -78,18 +83,12 @@ def scan(
         _require_tracked(project, name, sequences)
     labels = tuple(labels) or (() if entry is None else entry.labels)
     places = project.results / "scan" / name
-    with ExitStack() as opened:
-        recordings = [_open(project, sequence, labels, opened) for sequence in sequences]
-        shown = [find_handled(recording, name) for recording in recordings]
-        if improve:
-            parts = [
-                Posed(r, views, _poses(run_step("object_track", project, sequence, keep=True)))
-                for r, views, sequence in zip(recordings, shown, sequences, strict=True)
-            ]
-            mesh = finish(fuse(parts), parts, None)
-        else:
-            mesh = _scan(project, recordings, shown, name, labels, places)
-    _require_whole(mesh, name, sequences)
+    if hand_held:
+        mesh, underside = _scan_walk(project, name, sequences, improve=improve)
+        _require_whole(mesh, name, sequences, underside)
+    else:
+        mesh = _scan_turned(project, name, sequences, labels, places, improve=improve)
+        _require_whole(mesh, name, sequences)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(_ply(mesh.vertices, mesh.faces, mesh.colours))
     page = places / "scan.html"
@@ -101,6 +100,55 @@ def scan(
         lines.append("  look at the orange parts of the page: no camera measured them")
     print_plain(standard_console(), "\n".join([f"scan of {name}", *lines]))
     return mesh, path, page
+
+
+def _scan_walk(
+    project: Project, name: str, sequences: Sequence[str], *, improve: bool
+) -> tuple[ScannedMesh, float]:
+    """Scan an object at rest around which one camera was carried.
+
+    Returns the mesh, and the share of its surface on the plane on which it stands.
+    """
+    if len(sequences) > 1 or improve:
+        raise UserError(
+            f"--hand-held takes one sequence and not --improve, but {', '.join(sequences)} "
+            f"{'with' if improve else 'without'} --improve was given; scan each walk into a file "
+            "of its own (--output), and keep the best"
+        )
+    run_step("frames", project, sequences[0], keep=True)
+    with Frames.open(project.artefact(sequences[0], "frames")) as frames:
+        images = HandHeld(frames)
+        walk = follow(images)
+        standing = find_standing(walk, f"sequence {sequences[0]}, object {name!r}")
+        part = posed(images, walk, standing)
+        up = np.array([0.0, 0.0, 1.0])
+        surface = fuse([part], up=up, ground=0.0)
+        underside = (surface.vertices[:, 2] < ON_PLANE_M) & ~surface.measured
+        areas = trimesh.triangles.area(surface.vertices[surface.faces])
+        share = float(areas[underside[surface.faces].all(1)].sum() / areas.sum())
+        return finish(surface, [part], up), share
+
+
+def _scan_turned(
+    project: Project,
+    name: str,
+    sequences: Sequence[str],
+    labels: Sequence[str],
+    places: Path,
+    *,
+    improve: bool,
+) -> ScannedMesh:
+    """Scan an object that a person turns, that rests before the rig, or that is tracked."""
+    with ExitStack() as opened:
+        recordings = [_open(project, sequence, labels, opened) for sequence in sequences]
+        shown = [find_handled(recording, name) for recording in recordings]
+        if improve:
+            parts = [
+                Posed(r, views, _poses(run_step("object_track", project, sequence, keep=True)))
+                for r, views, sequence in zip(recordings, shown, sequences, strict=True)
+            ]
+            return finish(fuse(parts), parts, None)
+        return _scan(project, recordings, shown, name, labels, places)
 
 
 def _require_tracked(project: Project, name: str, sequences: Sequence[str]) -> None:
@@ -116,7 +164,14 @@ def _require_tracked(project: Project, name: str, sequences: Sequence[str]) -> N
 
 def _open(project: Project, sequence: str, labels: Sequence[str], opened: ExitStack) -> Recording:
     """Run the stages that a scan needs, and open their artefacts."""
-    for stage in (*READ, "body_fit"):
+    run_step("frames", project, sequence, keep=True)
+    with Frames.open(project.artefact(sequence, "frames")) as frames:
+        if camera_moves(frames):
+            raise UserError(
+                f"sequence {sequence}: its only camera moves; give --hand-held if the object rests "
+                "on a table or on the floor, or let the camera stand"
+            )
+    for stage in (*READ[1:], "body_fit"):
         run_step(stage, project, sequence, keep=True)
     frames = opened.enter_context(Frames.open(project.artefact(sequence, "frames")))
     recording = Recording(
@@ -236,21 +291,33 @@ def _require_poses(part: Posed, name: str) -> None:
         )
 
 
-def _require_whole(mesh: ScannedMesh, name: str, sequences: Sequence[str]) -> None:
-    """Raise UserError if the scan is in pieces, or too much of its surface was never measured."""
-    if mesh.closed_share > MAX_CLOSED:
+def _require_whole(
+    mesh: ScannedMesh, name: str, sequences: Sequence[str], underside: float | None = None
+) -> None:
+    """Raise UserError if the scan is in pieces, or too much of its surface was never measured.
+
+    ``underside``: share of the surface on which the object stood, of a hand-held camera.
+    """
+    closed = mesh.closed_share - (underside or 0.0)
+    if closed > MAX_CLOSED:
+        advice = (
+            f"in which it turned by {mesh.turned_deg:.0f} degrees; at most {MAX_CLOSED:.0%} is "
+            "closed. Turn it so that every side faces the cameras, also its underside, or add a "
+            "recording in which it is held in another place"
+            if underside is None
+            else f"without its underside; at most {MAX_CLOSED:.0%} is closed. Walk around it with "
+            "the camera low and high"
+        )
         raise UserError(
-            f"object {name!r}: no camera measured {mesh.closed_share:.0%} of its surface in "
-            f"{', '.join(sequences)}, in which it turned by {mesh.turned_deg:.0f} degrees; at most "
-            f"{MAX_CLOSED:.0%} is closed. Turn it so that every side faces the cameras, also its "
-            "underside, or add a recording in which it is held in another place"
+            f"object {name!r}: no camera measured {closed:.0%} of its surface in "
+            f"{', '.join(sequences)}, {advice}"
         )
     if mesh.explained_share < MIN_EXPLAINED:
         raise UserError(
             f"object {name!r}: only {mesh.explained_share:.0%} of the points that show it in "
             f"{', '.join(sequences)} are on the mesh, expected {MIN_EXPLAINED:.0%}: its poses are "
-            "wrong in a part of the frames. Turn it more slowly, hold it with few fingers, and let "
-            "it stand alone for a second"
+            "wrong in a part of the frames. Turn it, or walk, more slowly, hold it with few "
+            "fingers, and let it stand alone for a second"
         )
     if mesh.apart_share > MAX_APART:
         raise UserError(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp
 
@@ -51,9 +52,10 @@ class Cloud:
     def thinned(self, cell_m: float) -> Cloud:
         """Mean point and normal of each cell. Opposite surfaces in a cell are kept apart."""
         octants = (self.normals > 0) @ np.array([1, 2, 4])
-        keys = np.column_stack([np.floor(self.points / cell_m), octants]).astype(np.int64)
-        _, cell, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-        cell = cell.ravel()
+        cells = np.floor(self.points / cell_m).astype(np.int64)
+        x, y, z = (cells - cells.min(0)).T
+        keys = ((x * (y.max() + 1) + y) * (z.max() + 1) + z) * 8 + octants
+        _, cell, count = np.unique(keys, return_inverse=True, return_counts=True)
         points, normals = (
             np.stack([np.bincount(cell, values[:, k]) for k in range(3)], 1) / count[:, None]
             for values in (self.points, self.normals)
@@ -71,7 +73,11 @@ class Model:
         self._tree = cKDTree(cloud.points)
 
     def register(
-        self, cloud: Cloud, start: np.ndarray, reach_m: float = REACH_M
+        self,
+        cloud: Cloud,
+        start: np.ndarray,
+        reach_m: float = REACH_M,
+        finest_m: float = 3 * NOISE_M,
     ) -> tuple[np.ndarray, float]:
         """Pose of the object that aligns a cloud in the master frame with the model.
 
@@ -81,8 +87,8 @@ class Model:
         Args:
             cloud: points that show the object, master frame.
             start: (4, 4) master_from_object.
-            reach_m: largest distance of corresponding points in the first step. It shrinks to
-                three times the noise.
+            reach_m: largest distance of corresponding points in the first step.
+            finest_m: to which it shrinks.
         """
         object_from_master = invert(start)
         about = apply(object_from_master, cloud.points.mean(0)[None])[0]
@@ -90,7 +96,7 @@ class Model:
         moved_by = np.zeros(6)
         share = 0.0
         for step in range(STEPS):
-            reach = max(reach_m * 0.8**step, 3 * NOISE_M)
+            reach = max(reach_m * 0.8**step, finest_m)
             own = cloud.moved(object_from_master)
             distance, near = self._tree.query(own.points, distance_upper_bound=reach)
             near[~np.isfinite(distance)] = 0
@@ -114,7 +120,28 @@ class Model:
             object_from_master = step_about @ object_from_master
             if step > 5 and np.abs(change).max() < 1e-5:
                 break
-        return invert(object_from_master), share
+        # products of rounded rotations would leave the rotations, faster with each frame
+        rotation = Rotation.from_matrix(object_from_master[:3, :3]).as_matrix()
+        return invert(rigid(rotation, object_from_master[:3, 3])), share
+
+    def overlap(self, cloud: Cloud, pose: np.ndarray, reach_m: float) -> tuple[float, float]:
+        """Share of the points of a cloud near the model, and share of these on its surface.
+
+        Args:
+            cloud: points in the master frame.
+            pose: (4, 4) master_from_object.
+            reach_m: distance of points that are near; on the surface are those within three times
+                :data:`NOISE_M` along the normal.
+        """
+        own = cloud.moved(invert(pose))
+        distance, near = self._tree.query(own.points, distance_upper_bound=reach_m)
+        found = np.isfinite(distance)
+        if not found.any():
+            return 0.0, 0.0
+        points, normals = own.points[found], self.cloud.normals[near[found]]
+        off = np.abs((normals * (points - self.cloud.points[near[found]])).sum(1))
+        agree = (own.normals[found] * normals).sum(1) > FACING
+        return float(found.mean()), float((agree & (off < 3 * NOISE_M)).mean())
 
 
 def some(cloud: Cloud, count: int = MAX_POINTS) -> Cloud:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scan.handled import Chain
-from intercap_core.scan.surfaces import OBJECT, OTHER, UNKNOWN, Recording, ViewSurface
+from intercap_core.scan.surfaces import OBJECT, OTHER, UNKNOWN, DepthImages, ViewSurface
 from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
 
 MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurements mix surfaces
@@ -20,6 +20,7 @@ NEAREST_M = 0.1  # a camera nearer than this to the box is left out
 MARGIN_M = 0.02  # of the grid around the points
 FINEST_M = 0.002  # voxel; noise of the averaged surface is not finer
 FUSED_SETS = 60  # frame sets of a recording that are fused, at most twice as many
+ON_GROUND_M = 0.008  # distance of a point on the plane on which the object stands: noise of depth
 LOWEST = 0.5  # percentile of the points' heights on which an object stands
 VOXELS_ALONG = 250  # along the longest side of the object
 COLOURED_SETS = 12  # frame sets whose images give the colours
@@ -29,7 +30,7 @@ COLOURED_SETS = 12  # frame sets whose images give the colours
 class Posed:
     """A recording, and what is known of the object in it."""
 
-    recording: Recording
+    recording: DepthImages
     surfaces: Chain
     """Points that show the object, by frame set."""
     poses: Mapping[int, np.ndarray]
@@ -47,7 +48,11 @@ class Posed:
 
 
 def fuse(
-    parts: Sequence[Posed], *, up: np.ndarray | None = None, along: int = VOXELS_ALONG
+    parts: Sequence[Posed],
+    *,
+    up: np.ndarray | None = None,
+    ground: float | None = None,
+    along: int = VOXELS_ALONG,
 ) -> ClosedSurface:
     """Closed surface from all recordings, in the object's frame.
 
@@ -55,6 +60,8 @@ def fuse(
         parts: recordings with poses of the object.
         up: (3,) direction up in the object's frame, if no frame set shows the underside: the
             object ends at its lowest points. None = it was lifted and turned.
+        ground: height along ``up`` of the plane on which the object stands, metres; None = not
+            known. The plane is fused with the object, and the object ends there.
         along: voxels along the longest side of the object.
     """
     points = np.concatenate([part.points(t) for part in parts for t in part.sets])
@@ -70,14 +77,18 @@ def fuse(
             for c in part.recording.cameras:
                 image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)
                 if image is not None:
+                    if up is not None and ground is not None:
+                        _label_ground(image, up, ground)
                     volume.integrate(image)
     if up is not None:
-        volume.exclude_below(up, float(np.percentile(points @ up, LOWEST)))
+        if ground is None:
+            ground = float(np.percentile(points @ up, LOWEST))
+        volume.exclude_below(up, ground)
     return volume.surface()
 
 
 def _labelled(
-    recording: Recording,
+    recording: DepthImages,
     t: int,
     c: int,
     view: ViewSurface | None,
@@ -128,6 +139,19 @@ def _labelled(
     )
 
 
+def _label_ground(image: LabelledDepth, up: np.ndarray, ground: float) -> None:
+    """Label the pixels on the plane up . x = ground of the object's frame as the object."""
+    fx, fy, cx, cy = image.pinhole
+    row, column = np.indices(image.depth.shape)
+    rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(image.depth.shape)], -1)
+    normal = image.depth_from_object[:3, :3] @ up
+    slope = rays @ normal
+    height = image.depth * slope - normal @ image.depth_from_object[:3, 3] - ground
+    on = (image.kind == OTHER) & (np.abs(height) < ON_GROUND_M)
+    image.kind[on] = OBJECT
+    image.weight[on] = (slope[on] / np.linalg.norm(rays[on], axis=1)) ** 2
+
+
 def vertex_colours(vertices: np.ndarray, parts: Sequence[Posed]) -> np.ndarray:
     """Colours (V, 3) uint8, sRGB: the median of the nearest five coloured points of each vertex."""
     points, colours = [], []
@@ -137,8 +161,9 @@ def vertex_colours(vertices: np.ndarray, parts: Sequence[Posed]) -> np.ndarray:
                 image = part.recording.frames.colour(t, view.camera)
                 if image is None:
                     continue
-                points.append(apply(invert(part.poses[t]), view.points))
-                colours.append(image.reshape(-1, 3)[view.colour_pixels])
+                shown = view.colour_pixels >= 0
+                points.append(apply(invert(part.poses[t]), view.points[shown]))
+                colours.append(image.reshape(-1, 3)[view.colour_pixels[shown]])
     if not points:
         return np.full((len(vertices), 3), 128, np.uint8)
     _, near = cKDTree(np.concatenate(points)).query(vertices, 5)

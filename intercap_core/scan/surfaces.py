@@ -55,7 +55,22 @@ class ViewSurface:
         return ViewSurface(self.camera, *(values[kept] for values in arrays))
 
 
-class Recording:
+class DepthImages:
+    """Depth images of cameras with known poses."""
+
+    def __init__(self, frames: Frames, rig: Rig, cameras: Sequence[int], bias: np.ndarray) -> None:
+        """Take the ``cameras`` of ``rig``, whose depth is too large by ``bias`` (C,) metres."""
+        self.frames, self.rig, self.cameras, self.bias = frames, rig, cameras, bias
+
+    def depth(self, t: int, c: int) -> np.ndarray | None:
+        """Depth (H, W) float32, metres, without the camera's bias; 0 = none."""
+        image = self.frames.depth(t, c)
+        if image is None:
+            return None
+        return np.where(image > 0, image * np.float32(1e-3) - np.float32(self.bias[c]), 0)
+
+
+class Recording(DepthImages):
     """Images, masks and bodies of a recording, by moment."""
 
     def __init__(
@@ -76,17 +91,16 @@ class Recording:
                 Points on it are left out of the object.
             labels: detector classes of the object; empty = all candidates but the person.
         """
-        self.rig = Rig.from_scene(scene)
+        rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as source:
             self._count = len(source["times"])
-            self.frames = frames.showing(source["image_of"])
-            self.bias = np.nan_to_num(source["depth_bias"])
+            frames = frames.showing(source["image_of"])
+            bias = np.nan_to_num(source["depth_bias"])
             self.zup_from_master = source["zup_from_master"]
             moments = Detections.load(detections).showing(source["image_of"])
-            usable = source["present"] & np.isfinite(self.rig.master_from_colour).all((1, 2))
-        self.cameras = [
-            c for c, camera in enumerate(self.rig) if camera.depth is not None and usable[c]
-        ]
+            usable = source["present"] & np.isfinite(rig.master_from_colour).all((1, 2))
+        cameras = [c for c, camera in enumerate(rig) if camera.depth is not None and usable[c]]
+        super().__init__(frames, rig, cameras, bias)
         self.detections = moments.with_candidates_of(person)
         self.labels = frozenset(labels)
         with artefacts.read(person, PERSON) as source:
@@ -101,13 +115,6 @@ class Recording:
         rle = self._masks[t * len(self.rig) + c]
         lens = self.rig[c].colour
         return Runs(rle, lens.height, lens.width) if rle else None
-
-    def depth(self, t: int, c: int) -> np.ndarray | None:
-        """Depth (H, W) float32, metres, without the camera's bias; 0 = none."""
-        image = self.frames.depth(t, c)
-        if image is None:
-            return None
-        return np.where(image > 0, image * np.float32(1e-3) - np.float32(self.bias[c]), 0)
 
     def surfaces(self, t: int) -> list[ViewSurface]:
         """Points of all cameras that candidates cover, at moment t."""
@@ -137,7 +144,7 @@ class Recording:
         if mask is not None:
             covered &= ~mask.sample(column, row)
         shown = image.copy()
-        shown[_floating(image)] = 0
+        shown[floating(image)] = 0
         index = lookup.depth_index[covered]
         kept = shown.ravel()[index] > 0
         index, colour = index[kept], lookup.colour_index[covered][kept]
@@ -154,7 +161,7 @@ class Recording:
         return ViewSurface(c, index, points.astype(np.float32), normals.astype(np.float32), colour)
 
 
-def _floating(image: np.ndarray) -> np.ndarray:
+def floating(image: np.ndarray) -> np.ndarray:
     """Mask (H, W) of pixels at a depth edge, whose measurement mixes two surfaces.
 
     ``image``: (H, W) uint16 mm. More than 3 cm of depth between neighbours is an edge.

@@ -25,6 +25,7 @@ from intercap_core.errors import UserError
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS, TRUTH
+from intercap_core.studio.hand_held import CarriedKinect, write_walk_truth
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import MaskSimulator
@@ -252,9 +253,9 @@ def make_capture(
 ) -> None:
     """Write the folder of one capture; equal arguments give equal bytes.
 
-    Writes recordings and calibration in the layout of ``capture``, keypoints, candidates and
-    truth.h5. Writes annotation.yaml if the capture annotates or states starts, and last
-    capture.json with the SHA-256 of every file.
+    Writes recordings and calibration in the layout of ``capture`` and truth.h5; keypoints and
+    candidates unless the camera is hand-held. Writes annotation.yaml if the capture annotates or
+    states starts, and last capture.json with the SHA-256 of every file.
 
     Args:
         objects: entry of the tracked object, None for a person alone.
@@ -276,6 +277,12 @@ def make_capture(
     (output / MARK).touch()
     stage = StudioStage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
+    if capture.camera == "hand_held":
+        poses = CarriedKinect(stage, 0, settings.colour_mode).record_walk(folder)
+        folder.write_calibration(stage.rig.claimed, settings.fps)
+        write_walk_truth(output / "truth.h5", stage, poses, sequence, capture.interaction)
+        _write_manifest(output, sequence)
+        return
     kind = Detector if capture.keypoints == "simulated" else MeasuredDetector
     detector = kind.build(stage.noise, stage.frames, capture.keypoint_bias)
     segmenter = MaskSimulator(

@@ -224,20 +224,26 @@ class Kinect:
     def _inertial(
         self, t: int, rng: np.random.Generator
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Acceleration (m/s^2), turning rate (rad/s) and device time (us) of the samples of a set.
-
-        The device does not move: its accelerometer measures the reaction to gravity.
-        """
-        up = ACCELEROMETER_FROM_DEPTH @ self._depth_pose[:3, :3].T @ (0, 0, self.gravity)
+        """Acceleration (m/s^2), turning rate (rad/s) and device time (us) of the samples of a
+        set."""
         first, period = self.device_time_us(t), 1_000_000 // self.stage.fps
-        return [
-            (
-                up + rng.normal(0, self.accelerometer_noise, 3),
-                rng.normal(0, self.gyroscope_noise, 3),
-                first + k * period // self.imu_per_frame,
+        samples = []
+        for k in range(self.imu_per_frame):
+            time_us = first + k * period // self.imu_per_frame
+            felt, rate = self._motion((time_us - self.start_us) * 1e-6)
+            samples.append(
+                (
+                    ACCELEROMETER_FROM_DEPTH @ felt + rng.normal(0, self.accelerometer_noise, 3),
+                    ACCELEROMETER_FROM_DEPTH @ rate + rng.normal(0, self.gyroscope_noise, 3),
+                    time_us,
+                )
             )
-            for k in range(self.imu_per_frame)
-        ]
+        return samples
+
+    def _motion(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Acceleration (3,), m/s^2, with the reaction to gravity, and turning rate (3,), rad/s, in
+        the depth camera's frame. The device of a rig does not move."""
+        return self._depth_pose[:3, :3].T @ (0, 0, self.gravity), np.zeros(3)
 
     def _detected(
         self,

@@ -276,10 +276,8 @@ class Photographer:
     jpeg_quality = 85  # of the device's compression
 
     def __init__(self, view: RoomView, gain: np.ndarray, rng: np.random.Generator) -> None:
-        self.view = view
         self.gain = (gain ** (1 / CAMERA_GAMMA)).astype(np.float32)
-        room = np.clip(view.colour * self.gain * 255, 0, 255)
-        self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
+        self.look_through(view)
         # sensor noise: a tile that is shifted at random in each image
         size = (view.lens.height + 64, view.lens.width + 64, 3)
         tile = gaussian(rng, size) * np.float32(self.sensor_noise)
@@ -288,6 +286,12 @@ class Photographer:
         self._brighter = np.maximum(tile, 0).astype(np.uint8)
         self._darker = np.maximum(-tile, 0).astype(np.uint8)
         self._rng = rng
+
+    def look_through(self, view: RoomView) -> None:
+        """Photograph the room of ``view`` from now on."""
+        self.view = view
+        room = np.clip(view.colour * self.gain * 255, 0, 255)
+        self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
 
     def photograph(self, cast: Cast) -> np.ndarray:
         """The image (H, W, 3) uint8 BGR."""

@@ -91,7 +91,7 @@ class DepthSensor:
         large: LargeErrors | None = None,
         stereo: bool = False,
     ) -> None:
-        self.view, self._noise, self._limits = view, noise, LIMITS[mode]
+        self._noise, self._limits = noise, LIMITS[mode]
         rng = noise.rng("depth", name)
         self._rng = rng
         self.bias = float(noise.tails(rng.normal(size=1))[0]) * self.bias_m * noise.scale
@@ -103,16 +103,21 @@ class DepthSensor:
             self.edge_m, self.edge_px = large.edge_m, large.edge_px
             self.flying, self.lost_at_edge = large.flying, large.lost_at_edge
         self._ripple = rng.uniform(0, 2 * np.pi)
+        self._in_field = _field(view.lens, mode)
+        self.look_through(view)
+
+    def look_through(self, view: RoomView) -> None:
+        """Measure the room of ``view`` from now on; the camera and its errors stay the same."""
+        self.view = view
         direction = view.directions()
         self._direction = direction / np.maximum(
             np.linalg.norm(direction, axis=-1, keepdims=True), 1e-9
         )
-        self._in_field = _field(view.lens, mode)
         self._finite = np.isfinite(view.depth)
         self._room = np.where(self._finite, view.depth, 0)
         self._cosine = np.einsum("hwc,hwc->hw", view.normal, self._direction)
         risk = self._risk(view.depth, self._cosine, np.ones_like(view.depth))
-        blotches = _blotches(rng, view.depth.shape, 2.0, 0.28)
+        blotches = _blotches(self._rng, view.depth.shape, 2.0, 0.28)
         self._static_holes = blotches < np.where(np.isfinite(risk), risk, 1)
 
     def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:

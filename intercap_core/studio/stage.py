@@ -239,6 +239,16 @@ def check_capture(
             "set layout: plain",
         ),
         (
+            capture.camera == "hand_held" and (settings.cameras != 1 or not capture.depth),
+            f"a hand-held camera is alone and has depth; 'cameras' is {settings.cameras}, 'depth' "
+            f"is {str(capture.depth).lower()}; set cameras: 1 and depth: true",
+        ),
+        (
+            capture.camera == "hand_held" and not wanted,
+            f"interaction {capture.interaction!r} has no object for a hand-held camera; choose "
+            "another interaction",
+        ),
+        (
             capture.sound and not capture.video,
             "only videos carry sound; take 'sound' out or set video: true and layout: plain",
         ),

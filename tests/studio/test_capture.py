@@ -26,7 +26,7 @@ from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.schemas import TRUTH
+from intercap_core.schemas import HAND_HELD_TRUTH, TRUTH
 from intercap_core.studio.capture import MARK, make_capture
 from intercap_core.studio.subjects import Subject
 from tests.helpers.fitted_capture import object_entry
@@ -215,3 +215,25 @@ def test_feet_in_heavy_shoes_count_as_supported(capture: Path) -> None:
     standing = truth.vertices[:, height.max(0) < 0.01]
     still = np.repeat(standing[:1], 2, 0)
     assert support(still, truth.floor, 15).all()
+
+
+def test_a_hand_held_camera_sees_the_object_from_its_true_poses(tmp_path: Path) -> None:
+    walk = StudioCapture(
+        interaction="bottle_scan", subject="s03", seed=9222, frames=3, camera="hand_held"
+    )
+    settings = SETTINGS.model_copy(update={"cameras": 1})
+    folder = tmp_path / "walk"
+    make_capture(walk, settings, sequence="walk", objects=object_entry("bottle"), output=folder)
+    with artefacts.read(folder / "truth.h5", HAND_HELD_TRUTH) as truth:
+        poses = truth["object_from_colour"]
+        surface = DistanceField(truth["object_vertices"], truth["object_faces"])
+    _, depths = images(folder / "k1.mkv")
+    assert not (folder / "keypoints").exists() and len(depths) == len(poses) == 3
+    camera = claimed_camera(folder, "k1")
+    for depth, pose in zip(depths, poses, strict=True):
+        points = master_points(depth, camera.moved(pose)).points
+        distance = surface.distance(points[np.abs(points).max(1) < 0.3].astype(float))
+        on_bottle = distance[distance < 0.03]
+        assert len(on_bottle) > 1000 and np.median(on_bottle) < 0.008
+    travelled = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert (travelled > 0.5).all()  # once around in three images

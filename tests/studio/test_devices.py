@@ -116,6 +116,7 @@ def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> 
         ({"every": {"k2": 3}, "layout": "behave"}, "'behave' all have one rate"),
         ({"shoes": "heavy", "interaction": "skateboard_ride"}, "bare soles meet the object"),
         ({"faults": ("dead_half",), "cameras": 1}, "need a second camera"),
+        ({"camera": "hand_held"}, "a hand-held camera is alone"),
     ],
 )
 def test_impossible_captures_are_refused(capture: dict[str, object], says: str) -> None:

@@ -40,19 +40,28 @@ from intercap_core.evaluation.scan_errors import (
 )
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project
-from intercap_core.schemas import TRUTH
+from intercap_core.schemas import HAND_HELD_TRUTH, TRUTH
 from intercap_core.stages import object_track
 
 AREA = "scan"
 # How a recording is scanned, by the end of its script's name
-TURNED, STILL, IMPROVED = "turned", "still", "improved"
+TURNED, STILL, IMPROVED, HAND_HELD = "turned", "still", "improved", "hand_held"
 WAYS = {"_scan": TURNED, "_still": STILL, "_carry": IMPROVED}
 
 
 def way_of(project: Project, sequence: str) -> str:
     """How a recording is scanned; "" = it is not."""
-    script = project.captures[sequence].interaction
+    capture = project.captures[sequence]
+    if capture.camera == HAND_HELD:
+        return HAND_HELD
+    script = capture.interaction
     return next((way for end, way in WAYS.items() if script.endswith(end)), "")
+
+
+def last_stage(project: Project) -> str | None:
+    """Stage ``body_fit``, unless the cameras are hand-held."""
+    hand_held = all(capture.camera == HAND_HELD for capture in project.captures.values())
+    return None if hand_held else "body_fit"
 
 
 def measure(project: Project, sequence: str) -> ScanErrors:
@@ -61,7 +70,8 @@ def measure(project: Project, sequence: str) -> ScanErrors:
     assert entry is not None  # a script with an object
     path = project.results / "scans" / f"{sequence}.ply"
     path.parent.mkdir(exist_ok=True)
-    with artefacts.read(truth_of(project, sequence), TRUTH) as true:
+    schema = HAND_HELD_TRUTH if way == HAND_HELD else TRUTH
+    with artefacts.read(truth_of(project, sequence), schema) as true:
         truth = Mesh(true["object_vertices"].astype(np.float64), true["object_faces"])
     before = float("nan")
     if way == IMPROVED:
@@ -75,8 +85,9 @@ def measure(project: Project, sequence: str) -> ScanErrors:
         before = float(np.mean(distances(given, truth)))
     try:
         found, *_ = scan(
-            project, entry.name, [sequence], output=path, improve=way == IMPROVED, replace=True
-        )
+            project, entry.name, [sequence], output=path, improve=way == IMPROVED,
+            hand_held=way == HAND_HELD, replace=True,
+        )  # fmt: skip
     except UserError as error:
         nothing = np.zeros(0)
         return ScanErrors(sequence, entry.name, nothing, nothing, problem=str(error), way=way)
@@ -169,11 +180,12 @@ def print_scans(evaluations: Sequence[Scans]) -> None:
 
 PART = EvaluationPart(
     name="scan",
-    stage="body_fit",
-    settings=config_files("scan", "config"),
+    stage="frames",
+    settings=config_files("scan", "config", "hand_held"),
     budget_minutes=10.0,
     measure=measure,
     flat=flat,
     print_tables=print_scans,
+    last=last_stage,
     has=lambda project, sequence: bool(way_of(project, sequence)),
 )
