@@ -21,11 +21,12 @@ import cv2
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.output.export import images
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates
 
-# Six cameras of 15 images a second need some 2 MB per second at this size, the body's mesh as much.
+# Six cameras of 15 images a second need some 2 MB per second at this size, the body's mesh 5 MB.
 MAX_WIDTH = 640  # pixels
 JPEG_QUALITY = 80
 _SKIN, _CONTACT = (184, 153, 133), (220, 40, 40)  # sRGB
@@ -37,7 +38,7 @@ def write(path: Path, content: Content) -> None:
     import rerun as rr
 
     recording = rr.RecordingStream("intercap-core", recording_id=content.motion.sequence)
-    recording.save(path)
+    recording.save(path, default_blueprint=_layout(content))
     about = content.about.to_json_text(Coordinates.of(content.viewed))
     recording.log("about", rr.TextDocument(about, media_type="application/json"), static=True)
     up = rr.ViewCoordinates.RIGHT_HAND_Z_UP if content.is_z_up else rr.ViewCoordinates.RDF
@@ -57,6 +58,26 @@ def write(path: Path, content: Content) -> None:
     recording.disconnect()
 
 
+def _layout(content: Content) -> Any:
+    """Lay out the viewer: scene and errors on the left, images of all cameras on the right."""
+    import rerun.blueprint as blueprint
+
+    scene = blueprint.Spatial3DView(origin="world", name="scene")
+    errors = blueprint.TimeSeriesView(origin="errors", name="estimated errors, mm")
+    views = [
+        blueprint.Spatial2DView(origin=f"world/cameras/{camera.name}/image", name=camera.name)
+        for camera in content.recorded
+    ]
+    about = blueprint.TextDocumentView(origin="about", name="facts")
+    return blueprint.Blueprint(
+        blueprint.Horizontal(
+            blueprint.Vertical(scene, errors, row_shares=[3, 1]),
+            blueprint.Tabs(blueprint.Grid(*views, name="images"), about),
+        ),
+        collapse_panels=True,
+    )
+
+
 def _set_frame(recording: Any, content: Content, t: int) -> None:
     recording.set_time("frame", sequence=t)
     recording.set_time("time", duration=float(content.scenes.times[t]))
@@ -72,7 +93,9 @@ def _log_body(recording: Any, content: Content) -> None:
     for t, in_master in enumerate(content.scenes.bodies):
         vertices = apply(content.viewed_from_master, in_master)
         _set_frame(recording, content, t)
-        recording.log("world/body", rr.Mesh3D.from_fields(vertex_positions=vertices))
+        normals = vertex_normals(vertices, faces)  # without them, the viewer draws no shading
+        surface = rr.Mesh3D.from_fields(vertex_positions=vertices, vertex_normals=normals)
+        recording.log("world/body", surface)
         if touching is not None:
             _log_contact(recording, "world/body/contact", vertices[touching.body.at(t)])
 
@@ -83,7 +106,10 @@ def _log_object(recording: Any, content: Content) -> None:
     mesh, motion, touching = content.mesh, content.viewed, content.about.touching
     assert mesh is not None
     shape = rr.Mesh3D(
-        vertex_positions=mesh.vertices, triangle_indices=mesh.faces, vertex_colors=mesh.colours
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=vertex_normals(mesh.vertices, mesh.faces),
+        vertex_colors=mesh.colours,
     )
     known = np.isfinite(motion.translation).all(axis=1)
     for t in range(len(motion)):

@@ -114,6 +114,7 @@ def test_errors_and_facts_are_in_it(table: Table, path: Path) -> None:
         assert {t: round(float(np.ravel(value)[0]), 2) for t, value in read.items()} == stated
     assert about["by_frame"]["stated_error_mm"]
     assert path.stat().st_size < 5e6
+    assert len(chunks.RrdReader(path).blueprints()) == 1
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
