@@ -330,7 +330,12 @@ def _named_files(project: Project) -> Iterator[tuple[str, Path | None, str]]:
 
 def _faults_of_reuse(rows: Mapping[str, SequenceEntry | None], table: Path) -> Iterator[str]:
     """Messages about rows whose columns of ``Stage.reuses`` name an unsuitable sequence."""
-    columns = [stage.reuses for stage in STAGES.values() if stage.reuses]
+    present = [row for row in rows.values() if row is not None]
+    columns = [
+        column
+        for stage in STAGES.values()
+        if (column := stage.reuses) and any(getattr(row, column) for row in present)
+    ]
     named: dict[str, set[str]] = {}
     for name, row in rows.items():
         for column in columns if row is not None else ():
@@ -361,7 +366,11 @@ def _mismatch(
     """Reason why ``row`` cannot reuse what was estimated in the row ``source``; "" = none."""
     if other == name:
         return "which is the row itself"
-    if row is None or source is None or column != "rig_from":
+    if row is None or source is None:
+        return ""
+    if column == "shape_from" and row.subject != source.subject:
+        return f"but {name!r} shows subject {row.subject!r} and {other!r} {source.subject!r}"
+    if column != "rig_from":
         return ""
     scales = row.calibration_scale, source.calibration_scale
     if row.calibration == source.calibration and scales[0] != scales[1]:

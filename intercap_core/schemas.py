@@ -31,7 +31,7 @@ BAD_BODY_M = 0.040
 
 # Axes that the header does not name belong to one file or to the group of one camera: B bytes, N or D
 # images or other items, M = T * C images, P people, parts or pairs of cameras, X expression
-# coefficients, E energy terms, G coverings, W thresholds, F features or faces. "NAME+1" are offsets.
+# coefficients, E energy terms, G coverings, U unknowns, W thresholds, F features or faces. "NAME+1" are offsets.
 _CAMERA_MODELS = {
     "camera_names": Field(("C",), "str", "camera names, in the order of all C axes"),
     "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),
@@ -273,13 +273,16 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
 
 BODY_FIT = Schema(
     name="body_fit",
-    version=4,
+    version=5,
     stage="body_fit",
     attributes={
         "sequence": "sequence name",
         "subject": "subject name",
         "gender": "gender of the body file",
         "body_model": "digest of the body file",
+    },
+    optional_attributes={
+        "shape_note": "why the shape of the sequence in shape_from was not used; absent if it was, or if none is named",
     },
     fields={
         **_body(one_shape=False),
@@ -324,6 +327,11 @@ BODY_FIT = Schema(
             ("G",),
             "float32",
             "logarithm of the ratio of each covering's thickness (clothes, hair, shoes) to its prior mean",
+        ),
+        "shared_covariance": Field(
+            ("U", "U"),
+            "float64",
+            "covariance of the unknowns that all frames share: betas (unless each frame has its own), keypoint_offsets, covering",
         ),
         "covering_noise": Field(
             ("G",), "float32", "standard deviation of the point clouds about each covering", "m"

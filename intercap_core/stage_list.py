@@ -154,6 +154,7 @@ STAGES: dict[str, Stage] = {
             name="body_fit",
             purpose="SMPL-X parameters in every frame.",
             reads=("frames", "scene", "person"),
+            reuses="shape_from",
             resources=JobResources(800, mb_per_image=0.05, seconds=15, seconds_per_image=0.06),
             output_bytes=1_100_000,
             estimates=True,

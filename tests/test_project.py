@@ -81,6 +81,7 @@ def objects(text: str) -> Edit:
 
 REUSE = HEADER.strip() + "\tcalibration_scale\trig_from\n"
 REUSED = "%s\ts01\tcup\trec\tcal\t%s\t%s\n"
+SHAPES = "one\ts01\tcup\trec\tcal\ttwo\ntwo\ts02\tcup\trec\tcal\t\n"
 
 
 def reuse(*cells: tuple[str, str, str]) -> Edit:
@@ -133,6 +134,10 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
     (
         reuse(("one", "1", "two"), ("two", "2", "")),
         ["'one' has rig_from 'two', but their calibration_scale differs: 1.0 for 'one', 2.0 for "],
+    ),
+    (
+        rows(SHAPES, HEADER.strip() + "\tshape_from\n"),
+        ["'one' has shape_from 'two', but 'one' shows subject 's01' and 'two' 's02'; name another"],
     ),
     (
         settings("dataset: x\njoint: {lemo: LEMO}\n"),

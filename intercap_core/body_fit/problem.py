@@ -21,6 +21,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.definition import POINTS, Definition
+from intercap_core.body_fit.shared_estimate import SharedEstimate
 from intercap_core.body_fit.surface import COVERINGS, Samples
 from intercap_core.body_fit.term_inputs import Bodies, Columns, TermInputs
 from intercap_core.body_fit.terms import CompiledTerms
@@ -77,6 +78,8 @@ class ParameterLayout:
     """Offsets and coverings are shared parameters; else they are fixed."""
     definition: Definition
     """Prior of the offsets."""
+    earlier: SharedEstimate | None = None
+    """Estimate from another sequence, which replaces all priors of shared parameters."""
 
     @property
     def shape(self) -> slice:
@@ -127,7 +130,8 @@ class ParameterLayout:
     def prior_cost(self, shared: Tensor) -> Tensor:
         """Return the cost (scalar) of the shared parameters (m,) that each frame adds."""
         mean, precision, _ = self.prior(shared)
-        return 0.5 * (precision * (shared - mean) ** 2).sum()
+        away = shared - mean
+        return 0.5 * away @ precision @ away
 
     def add_prior(self, shared: Tensor, equations: NormalEquations) -> None:
         """Add this cost to the normal equations of each frame, whose last columns are shared."""
@@ -135,8 +139,8 @@ class ParameterLayout:
             mean, precision, _ = self.prior(shared)
             first = equations.gradient.shape[1] - len(shared)
             equations.cost.add_(self.prior_cost(shared))
-            equations.gradient[:, first:] += precision * (shared - mean)
-            equations.hessian.diagonal(dim1=1, dim2=2)[:, first:] += precision
+            equations.gradient[:, first:] += precision @ (shared - mean)
+            equations.hessian[:, first:, first:] += precision
 
     def prior(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the Gaussian prior of the m shared parameters in the floating type of ``like``.
@@ -147,7 +151,8 @@ class ParameterLayout:
 
         Returns:
             (m,) means.
-            (m,) precisions that each frame adds: count / sigma^2.
+            (m, m) precision that each frame adds: the inverse covariance, of which row i and
+                column j are multiplied by sqrt(count_i count_j).
             (m,) counts; tuned on the studio.
         """
         mean, sigma, counts = [like.new_zeros(0)], [like.new_zeros(0)], [like.new_zeros(0)]
@@ -163,7 +168,14 @@ class ParameterLayout:
             sigma.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
             counts.append(like.new_full((len(COVERINGS),), 0.7))
         per_frame = torch.cat(counts)
-        return torch.cat(mean), per_frame / torch.cat(sigma) ** 2, per_frame
+        if self.earlier is None:
+            return torch.cat(mean), torch.diag(per_frame / torch.cat(sigma) ** 2), per_frame
+        # parameters that are fixed have the mean of the prior
+        first = 0 if self.one_shape else self.num_betas
+        at, share = slice(first, first + len(per_frame)), per_frame.sqrt()
+        known = torch.as_tensor(self.earlier.mean).to(like)[at]
+        precision = torch.as_tensor(self.earlier.precision).to(like)[at, at]
+        return known, share[:, None] * precision * share, per_frame
 
 
 # --- energy ----------------------------------------------------------------------------------
@@ -188,6 +200,8 @@ class BodyProblem(TermInputs):
     """Fit offsets and coverings."""
     definition: Definition = field(default_factory=Definition.unknown)
     """Prior of the offsets."""
+    earlier: SharedEstimate | None = None
+    """Estimate from another sequence, which replaces all priors of shared parameters."""
     terms: CompiledTerms | None = None
     """The terms, which cache what they need of the model; None = new ones."""
 
@@ -200,8 +214,9 @@ class BodyProblem(TermInputs):
     def layout(self) -> ParameterLayout:
         """The current places of the parameters."""
         return ParameterLayout(
-            self.columns, self.model.num_betas, self.one_shape, self.fit_shared, self.definition
-        )
+            self.columns, self.model.num_betas, self.one_shape, self.fit_shared, self.definition,
+            self.earlier,
+        )  # fmt: skip
 
     def own_start(self) -> Tensor:
         """Return the current own parameters (T, n)."""

@@ -26,6 +26,7 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY
 from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import VPoser
 from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.definition import Definition
@@ -34,6 +35,7 @@ from intercap_core.body_fit.observations import Observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.quality import PartEvidence, compare_parts
 from intercap_core.body_fit.recover import recover
+from intercap_core.body_fit.shared_estimate import SharedEstimate
 from intercap_core.body_fit.start import START_SIGMA_M, fit_start
 from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.body_fit.term_inputs import Targets
@@ -112,6 +114,14 @@ class BodyFit:
     refitted: np.ndarray
     """(N,) bool: the energy of the frame has several minima (:func:`.recover.recover`)."""
 
+    def shared_estimate(self, sequence: str, covariance: Tensor) -> SharedEstimate:
+        """Return the shared parameters, with their covariance (m, m) of :mod:`.uncertainty`."""
+        offsets, u = self.settled.offsets, self.settled.covering
+        num_betas = len(covariance) - offsets.numel() - len(u)  # 0 if each frame has its own
+        betas = self.vectors[0, TRANSL.stop : TRANSL.stop + num_betas]
+        parts = (part.double().numpy() for part in (betas, offsets, u, covariance))
+        return SharedEstimate(sequence, *parts)
+
 
 class Fitter:
     """Fits all usable frames of one sequence.
@@ -124,6 +134,8 @@ class Fitter:
         pose_prior: learned prior of the body pose; None = the open prior.
         definition: prior of the keypoint offsets; None = unknown.
         window: the frames to use; None = all. ``clouds`` are those of the window.
+        earlier: estimate of the shared parameters from another sequence of the subject: their start
+            and, in place of ``definition`` and the prior of the shape, their prior; None = none.
     """
 
     def __init__(
@@ -135,8 +147,10 @@ class Fitter:
         pose_prior: VPoser | None = None,
         definition: Definition | None = None,
         window: slice | None = None,
+        earlier: SharedEstimate | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
+        self.earlier = earlier
         self.definition = definition or Definition.unknown()
         self._progress = Progress(log, "body: minimised", None, "rounds")
         self.evidence = Evidence(model, observations, clouds, settings.cloud_weight, window)
@@ -147,18 +161,26 @@ class Fitter:
         """Fit all frames by the stages of the module."""
         evidence, hands, face = self.evidence, self.settings.hands, self.settings.face
         base = self.model.zeros(len(self.frames)).vector()
+        offsets, u = self.definition.offsets, np.zeros(len(COVERINGS))
+        if self.earlier:
+            offsets, u = self.earlier.offsets, self.earlier.u
         problem = self._problem(
             base=base,
             columns=columns_of(self.model, hands=False, face=False, betas=not self.one_shape),
             one_shape=self.one_shape,
-            offsets=torch.as_tensor(self.definition.offsets).to(base),
-            u=base.new_zeros(len(COVERINGS)),
+            offsets=torch.as_tensor(offsets).to(base),
+            u=torch.as_tensor(u).to(base),
             definition=self.definition,
+            earlier=self.earlier,
         )
         problem.base = fit_start(evidence, problem)
         if self.one_shape:
             shape = problem.layout.shape
-            problem.base[:, shape] = problem.base[:, shape].median(0).values
+            problem.base[:, shape] = (
+                torch.as_tensor(self.earlier.betas).to(base)
+                if self.earlier
+                else problem.base[:, shape].median(0).values
+            )
         problem.targets = self._lift_by_depth()
         # stage 2
         for widened in _WIDENED if problem.targets else (1.0, 1.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +22,17 @@ _MODEL_SIGMA_M = 0.001
 CHUNK_FRAMES = 16  # frames whose derivatives are computed at once, limited by memory
 
 
-def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
-    """Return the covariance (N, 55, 3, 3) of each joint's position, master frame, square metres.
+class Covariances(NamedTuple):
+    """Covariances of a fit of N frames with m shared parameters."""
+
+    joints: Tensor
+    """(N, 55, 3, 3) of each joint's position, master frame, square metres."""
+    shared: Tensor
+    """(m, m) of the shared parameters, in the order of :mod:`.problem`."""
+
+
+def fit_covariances(model: BodyModel, fit: BodyFit) -> Covariances:
+    """Return the covariances of joints and shared parameters.
 
     With own parameters o of a frame, shared parameters s, and the blocks H of the Gauss-Newton
     matrix of the frame's energy, the covariance of a joint J(o, s) is
@@ -35,7 +45,8 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     H_oo^-1 H_os)_ij / sqrt(k_i k_j). k are the
     counts of the shared priors (:meth:`.problem.ParameterLayout.prior`). Errors of shared
     parameters are the same in every frame, so a recording counts as 1 / k independent frames, not
-    as its number of frames. sigma_m is the error of the body model.
+    as its number of frames. sigma_m is the error of the body model. S^-1 is the covariance of the
+    shared parameters.
     """
     own = len(fit.columns)
     betas = torch.arange(TRANSL.stop, TRANSL.stop + model.num_betas)
@@ -70,7 +81,7 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
             by_shared[..., : len(betas)] += full[..., betas]
         own_error = _covariance(factor, by_own) * excess[at]
         result[at] = own_error + _covariance(shared_factor, by_shared) + model_error
-    return result
+    return Covariances(result, torch.cholesky_inverse(shared_factor))
 
 
 def deviation(covariance: np.ndarray) -> np.ndarray:

@@ -66,7 +66,7 @@ def notes(stage: str, path: Path) -> list[str]:
                 for name, text in zip(names, artefact.text("note"), strict=True)
                 if text
             ]
-        for name in ("ground_note", "doubts"):
+        for name in ("ground_note", "doubts", "shape_note"):
             text = str(artefact.attributes.get(name, ""))
             # without an object, the track's doubts only repeat that there is none
             alone = name == "doubts" and not artefact.attributes.get("object", name)

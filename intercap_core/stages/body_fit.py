@@ -23,7 +23,8 @@ from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.recover import JUMP_M, measure_jumps
 from intercap_core.body_fit.schedule import BodyFit, Fitter
-from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
+from intercap_core.body_fit.shared_estimate import SharedEstimate
+from intercap_core.body_fit.uncertainty import Covariances, deviation, fit_covariances, widen
 from intercap_core.config import BodyFitSettings, BodyModels, digest
 from intercap_core.disk import DiskList
 from intercap_core.entries import SubjectEntry
@@ -44,12 +45,18 @@ def run(
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: BodyFitSettings,
+    shape_from: Path | None = None,
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
     A frame fails if it has too few keypoints, or if the fitted trunk is far from its keypoints. It
     also fails if only one view and no depth points show the person. Failed frames are marked
     ``failed`` and ``bridged``: their bodies are interpolated from neighbouring frames.
+
+    Args:
+        shape_from: body_fit artefact of another sequence of the subject, whose shape, coverings and
+            keypoint offsets are start and prior of this one's. They are not used if this recording
+            contradicts the shape.
 
     Raises UserError if no frame can be fitted, the body file cannot be used, or the artefacts do
     not belong together.
@@ -62,6 +69,10 @@ def run(
     check_body(model)
     pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)
+    earlier = None
+    if shape_from is not None:
+        body_model = file_digest(path)
+        earlier = SharedEstimate.read(shape_from, seen.sequence, subject, body_model, shapes)
     if not seen.usable.any():
         raise UserError(
             f"{person}: sequence {seen.sequence}: in none of its {seen.num_frames} frames do two "
@@ -72,7 +83,20 @@ def run(
     for cloud in person_clouds(frames, person, seen, settings.points_per_frame):
         clouds.append(cloud)
     definition = Definition.read(settings.keypoint_definition)
-    fit = Fitter(model, seen, clouds, settings, pose_prior, definition=definition).run()
+
+    def fit_with(earlier: SharedEstimate | None) -> tuple[BodyFit, Covariances, SharedEstimate]:
+        fit = Fitter(model, seen, clouds, settings, pose_prior, definition, earlier=earlier).run()
+        covariances = fit_covariances(model, fit)
+        return fit, covariances, fit.shared_estimate(seen.sequence, covariances.shared)
+
+    fit, covariances, shared = fit_with(earlier)
+    shape_note = {}
+    if earlier is not None and earlier.contradicts(shared):
+        shape_note["shape_note"] = (
+            f"the images contradict the shape of sequence {earlier.sequence} (shape_from), which "
+            "may show another person; it was not used"
+        )
+        fit, covariances, shared = fit_with(None)
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body
@@ -94,7 +118,7 @@ def run(
 
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.numpy()
-    stated = _state_uncertainty(model, fit, seen.times, fitted, joints)
+    stated = _state_uncertainty(model, fit, covariances.joints.numpy(), seen.times, fitted, joints)
     keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
     keypoint_residual[fit.frames] = fit.pixel_residual.numpy()
     cloud_residual = np.full(seen.num_frames, np.nan)
@@ -107,6 +131,7 @@ def run(
         subject=subject.subject,
         gender=subject.gender,
         body_model=file_digest(path),
+        **shape_note,
     ) as writer:
         put_parameters(writer, params, joints, betas=shapes.betas(params.betas).numpy())
         writer.put("keypoint_residual", keypoint_residual)
@@ -117,6 +142,7 @@ def run(
         writer.put("keypoint_sigma", fit.settled.keypoint_sigma.numpy())
         writer.put("keypoint_doubt", fit.settled.keypoint_doubt.numpy())
         writer.put("covering", fit.settled.covering.numpy())
+        writer.put("shared_covariance", shared.of_file(shapes))
         writer.put("covering_noise", fit.settled.cloud_noise.numpy())
         put_clouds(writer, clouds, len(seen.rig))
         writer.put("failed", ~fitted)
@@ -140,7 +166,12 @@ class _Uncertainty(NamedTuple):
 
 
 def _state_uncertainty(
-    model: BodyModel, fit: BodyFit, times: np.ndarray, fitted: np.ndarray, joints: np.ndarray
+    model: BodyModel,
+    fit: BodyFit,
+    covariance: np.ndarray,
+    times: np.ndarray,
+    fitted: np.ndarray,
+    joints: np.ndarray,
 ) -> _Uncertainty:
     """Return the uncertainty of all frames: fitted and bridged.
 
@@ -148,13 +179,15 @@ def _state_uncertainty(
     limbs that only one view constrains, and in bridged frames.
 
     Args:
+        model: the body.
+        fit: the fit of N frames.
+        covariance: (N, 55, 3, 3) of its joints, square metres.
         times: (T,) seconds.
         fitted: (T,) bool; other frames are bridged.
         joints: (T, 55, 3) metres.
     """
     count = len(times)
     sigma = np.zeros((count, 55))
-    stated = joint_covariance(model, fit).numpy()
     # A jump of a joint may be a wrong minimum, so it widens sigma. Jumps count from JUMP_M on; for
     # joints that only keypoints of one view constrain, and in refitted frames, from 0 on.
     least = np.full_like(sigma, JUMP_M)
@@ -162,16 +195,16 @@ def _state_uncertainty(
     jumped = np.zeros_like(sigma)
     jumped[fitted] = measure_jumps(joints[fitted].astype(float), times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
-        quality.widen_sigma(deviation(stated), fit.parts),
+        quality.widen_sigma(deviation(covariance), fit.parts),
         jumped[fit.frames] / MEDIAN_CHI_3,
     )
     undetermined = np.ones((count, len(BODY_PARTS)), bool)
     undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)
     undetermined[~fitted] = True
     sigma = bridged_sigma(joints.astype(float), fitted, sigma, times)
-    covariance = np.zeros((*sigma.shape, 3, 3))
-    covariance[fit.frames] = stated
-    covariance[~fitted] = 0
+    stated = np.zeros((*sigma.shape, 3, 3))
+    stated[fit.frames] = covariance
+    stated[~fitted] = 0
     share = model.skinning_weights.double().mean(0).numpy()
     uncertain = fitted & (quality.expected_error(sigma, share) > BAD_BODY_M)
-    return _Uncertainty(sigma, widen(covariance, sigma), undetermined, uncertain)
+    return _Uncertainty(sigma, widen(stated, sigma), undetermined, uncertain)

@@ -10,7 +10,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.problem import columns_of
 from intercap_core.body_fit.quality import PartEvidence
 from intercap_core.body_fit.schedule import BodyFit, Settled
-from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
+from intercap_core.body_fit.uncertainty import deviation, fit_covariances, widen
 from intercap_core.schemas import BODY_PARTS
 
 SHARED = 10 + 75 + 8
@@ -33,7 +33,7 @@ def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> B
 
 
 def _sigma(model: BodyModel, fit: BodyFit) -> np.ndarray:
-    return deviation(joint_covariance(model, fit).numpy())
+    return deviation(fit_covariances(model, fit).joints.numpy())
 
 
 def _whole(model: BodyModel, fit: BodyFit) -> np.ndarray:

@@ -174,12 +174,12 @@ def test_another_model_reruns_the_detections(folder: Path) -> None:
     assert _pending() == expected
 
 
-def _reuse(folder: Path, rig_from: str) -> None:
-    """Let the row ``OTHER`` name a sequence in its column rig_from."""
+def _reuse(folder: Path, named: str, column: str = "rig_from") -> None:
+    """Let the row ``OTHER`` name a sequence in its column."""
     path = folder / SETTINGS.parent / "sequences.tsv"
     header, *rows = path.read_text().splitlines()
-    cells = [f"{row}\t{rig_from if row.startswith(OTHER) else ''}" for row in rows]
-    path.write_text("\n".join([f"{header}\trig_from", *cells, ""]))
+    cells = [f"{row}\t{named if row.startswith(OTHER) else ''}" for row in rows]
+    path.write_text("\n".join([f"{header}\t{column}", *cells, ""]))
 
 
 def test_another_sequence_whose_cameras_are_reused_counts(folder: Path) -> None:
@@ -198,6 +198,22 @@ def test_another_sequence_whose_cameras_are_reused_counts(folder: Path) -> None:
     assert _pending() == _of(ONE, *AFTER_SCENE) | expected
     reasons = Plan(load_project(SETTINGS)).states(OTHER)["scene"].reasons
     assert reasons == (f"scene of {ONE} changed",)
+
+
+def test_another_sequence_whose_shape_is_reused_counts(folder: Path) -> None:
+    """A change of the other's body makes this one's stale, and no stage before it."""
+    table = folder / SETTINGS.parent / "sequences.tsv"
+    table.write_text(table.read_text().replace("\ts04\t", "\ts03\t"))
+    _bring_up_to_date(load_project(SETTINGS))
+    _reuse(folder, ONE, "shape_from")
+    expected = _of(OTHER, "body_fit", "joint", *AFTER_JOINT) | DATASET
+    assert _pending() == expected
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    _annotate(folder, "subject: [{camera: k1, frame: 0, x: 612, y: 340}]\n", ONE)
+    assert _pending() == _of(ONE, *AFTER_SCENE - {"scene"}) | expected
+    reasons = Plan(load_project(SETTINGS)).states(OTHER)["body_fit"].reasons
+    assert reasons == (f"body_fit of {ONE} changed",)
 
 
 def test_cameras_of_an_excluded_sequence_are_reused_as_they_are(folder: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -290,6 +292,45 @@ def test_two_cameras_without_depth_are_enough(model: BodyModel, tmp_path: Path) 
     assert not found["failed"].any()
     assert np.isnan(found["cloud_residual"]).all()
     assert vertices.max() < 25 and joints.max() < 25 and hands.max() < 30
+
+
+def test_a_poor_recording_gets_the_shape_of_another(model: BodyModel, clothed, tmp_path) -> None:
+    """Keypoints of two views, with noise. The other sequence is also named with a false shape."""
+    _, known, folder = clothed
+    poor = Capture(
+        model, tmp_path, 3, cameras=5, depth=False, seen_by=(0, 1), clothing=0.01, pixel_noise=3.0
+    )
+    alone = poor.fit(tmp_path / "alone.h5")
+    reused = poor.fit(tmp_path / "reused.h5", shape_from=folder / "body_fit.h5")
+    truth = poor.vectors[0, 168:178].numpy()
+
+    def off(found: dict) -> float:
+        apart = model.shape_directions[..., :10].numpy() @ (found["betas"][0] - truth)
+        return float(np.linalg.norm(apart, axis=1).mean())
+
+    assert off(reused) < 0.5 * off(alone) and off(reused) < 1.2 * off(known)
+    assert "shape_note" not in reused
+    first, both = (np.diag(read["shared_covariance"]) for read in (known, reused))
+    assert (both <= 1.001 * first).all()
+    wrong = shutil.copy(folder / "body_fit.h5", tmp_path / "wrong.h5")
+    with h5py.File(wrong, "r+") as file:
+        file["betas"][:] += 3.0
+    refused = poor.fit(tmp_path / "refused.h5", shape_from=wrong)
+    assert "contradict the shape of sequence" in refused["shape_note"]
+    np.testing.assert_array_equal(refused["joints"], alone["joints"])
+
+
+def test_a_shape_of_another_kind_is_refused(clothed, tmp_path: Path) -> None:
+    capture, _, folder = clothed
+    for change, message in (
+        ({"settings": SETTINGS.model_copy(update={"betas": 8})}, "number of betas .* 10, expected"),
+        (
+            {"subject": SUBJECT.model_copy(update={"subject": "s02"})},
+            "subject .* expected s02",
+        ),
+    ):
+        with pytest.raises(UserError, match=message):
+            capture.fit(tmp_path / "out.h5", shape_from=folder / "body_fit.h5", **change)
 
 
 def test_a_named_vposer_draws_the_fit_to_its_pose(model, tmp_path: Path) -> None:

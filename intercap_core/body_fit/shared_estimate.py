@@ -1,0 +1,116 @@
+"""The parameters that all frames share, with their covariance: the result of one sequence, and the
+prior of another sequence of the same subject (column ``shape_from``).
+
+Errors of shared parameters are the same in every frame, so the covariance counts a recording as
+a few independent frames (:meth:`.problem.ParameterLayout.prior`). The whole matrix is passed on:
+an error of the shape is correlated with those of keypoint offsets and of clothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from intercap_core import artefacts
+from intercap_core.body.loading import ShapePrior
+from intercap_core.entries import SubjectEntry
+from intercap_core.errors import UserError
+from intercap_core.schemas import BODY_FIT
+
+# Probability below which a shape is that of another person.
+OTHER_PERSON = 1e-6
+# Directions of the shape of which the recording removes a smaller share of the prior's variance say
+# nothing about the prior.
+_LEAST_GAIN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class SharedEstimate:
+    """Gaussian of the m = S + 75 + G shared parameters, in the order of :mod:`.problem`."""
+
+    sequence: str
+    """Sequence that it was estimated from."""
+    betas: np.ndarray
+    """(S,) in units of the subject's prior; S = 0 if each frame has its own."""
+    offsets: np.ndarray
+    """(25, 3) keypoint offsets, metres."""
+    u: np.ndarray
+    """(G,) logarithms of the thickness of the coverings over the usual one."""
+    covariance: np.ndarray
+    """(m, m)"""
+
+    @classmethod
+    def read(
+        cls, path: Path, sequence: str, subject: SubjectEntry, body_model: str, shapes: ShapePrior
+    ) -> SharedEstimate:
+        """Read the estimate of a body_fit artefact.
+
+        Raises UserError if it is of another subject or body file, or has another number of betas.
+
+        Args:
+            path: body_fit artefact of another sequence.
+            sequence: this sequence, for messages.
+            subject: this sequence's subject.
+            body_model: digest of this sequence's body file.
+            shapes: prior of the subject's shape.
+        """
+        with artefacts.read(path, BODY_FIT) as fit:
+            other, covariance = str(fit.attributes["sequence"]), fit["shared_covariance"]
+            betas = fit["betas"][~fit["failed"]].astype(float)
+            offsets, u = fit["keypoint_offsets"].astype(float), fit["covering"].astype(float)
+            attributes = fit.attributes
+        count = len(shapes.mean)
+        shared = len(covariance) == betas.shape[1] + offsets.size + len(u)
+        for what, actual, expected in (
+            ("subject", attributes["subject"], subject.subject),
+            ("body file", attributes["body_model"], body_model),
+            ("number of betas", betas.shape[1], count),
+            ("setting body_fit.shape", "shared" if shared else "per_frame", "shared"),
+        ):
+            if actual != expected:
+                raise UserError(
+                    f"{path}: sequence {sequence!r} has shape_from {other!r}, but the {what} of "
+                    f"{other!r} is {actual}, expected {expected}; re-run stage 'body_fit' of "
+                    f"{other!r}, name another sequence in the row of {sequence!r}, or clear it"
+                )
+        z = np.linalg.solve(shapes.root, betas.mean(0) - shapes.mean)
+        to_z = block_diag(np.linalg.inv(shapes.root), np.eye(offsets.size + len(u)))
+        return cls(other, z, offsets, u, to_z @ covariance @ to_z.T)
+
+    def of_file(self, shapes: ShapePrior) -> np.ndarray:
+        """Return the covariance (m, m) with the betas of the body file, as an artefact holds it."""
+        count = len(self.betas)
+        to_file = block_diag(shapes.root[:count, :count], np.eye(len(self.covariance) - count))
+        return to_file @ self.covariance @ to_file.T
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(m,)"""
+        return np.concatenate([self.betas, self.offsets.ravel(), self.u])
+
+    @cached_property
+    def precision(self) -> np.ndarray:
+        """(m, m) inverse of the covariance."""
+        return np.linalg.inv(self.covariance)
+
+    def contradicts(self, posterior: SharedEstimate) -> bool:
+        """Whether the shape of a fit with this prior belongs to another person.
+
+        If prior and data are of one person, the fit changes the betas by a Gaussian step whose
+        covariance is the variance that the data remove, C_prior - C_posterior. The squared
+        Mahalanobis distance of the step, which is the normalised innovation squared, is then
+        chi-square distributed.
+        """
+        shape = slice(len(self.betas))
+        whiten = np.linalg.inv(np.linalg.cholesky(self.covariance[shape, shape]))
+        gain = np.eye(len(whiten)) - whiten @ posterior.covariance[shape, shape] @ whiten.T
+        removed, axes = np.linalg.eigh(gain)
+        step = axes.T @ whiten @ (posterior.betas - self.betas)
+        known = removed > _LEAST_GAIN
+        distance = np.sum(step[known] ** 2 / removed[known])
+        return bool(chi2.sf(distance, known.sum()) < OTHER_PERSON)
