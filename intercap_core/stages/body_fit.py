@@ -94,7 +94,8 @@ def run(
     if earlier is not None and earlier.contradicts(shared):
         shape_note["shape_note"] = (
             f"the images contradict the shape of sequence {earlier.sequence} (shape_from), which "
-            "may show another person; it was not used"
+            "was not used; check that both show the same person and have keypoints of the same "
+            "detector"
         )
         fit, covariances, shared = fit_with(None)
 
