@@ -24,9 +24,6 @@ from intercap_core.schemas import BODY_FIT
 
 # Probability below which a shape is that of another person.
 OTHER_PERSON = 1e-6
-# Directions of the shape of which the recording removes a smaller share of the prior's variance say
-# nothing about the prior.
-_LEAST_GAIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,19 +95,14 @@ class SharedEstimate:
         """(m, m) inverse of the covariance."""
         return np.linalg.inv(self.covariance)
 
-    def contradicts(self, posterior: SharedEstimate) -> bool:
-        """Whether the shape of a fit with this prior belongs to another person.
+    def contradicts(self, alone: SharedEstimate) -> bool:
+        """Whether the shape of a fit without this prior is that of another person.
 
-        If prior and data are of one person, the fit changes the betas by a Gaussian step whose
-        covariance is the variance that the data remove, C_prior - C_posterior. The squared
-        Mahalanobis distance of the step, which is the normalised innovation squared, is then
-        chi-square distributed.
+        The squared Mahalanobis distance of the betas is chi-square distributed if both estimates
+        are of one person. A fit with the prior cannot tell: it takes observations that the prior
+        contradicts for outliers.
         """
         shape = slice(len(self.betas))
-        whiten = np.linalg.inv(np.linalg.cholesky(self.covariance[shape, shape]))
-        gain = np.eye(len(whiten)) - whiten @ posterior.covariance[shape, shape] @ whiten.T
-        removed, axes = np.linalg.eigh(gain)
-        step = axes.T @ whiten @ (posterior.betas - self.betas)
-        known = removed > _LEAST_GAIN
-        distance = np.sum(step[known] ** 2 / removed[known])
-        return bool(chi2.sf(distance, known.sum()) < OTHER_PERSON)
+        away = alone.betas - self.betas
+        both = (self.covariance + alone.covariance)[shape, shape]
+        return bool(chi2.sf(away @ np.linalg.solve(both, away), len(away)) < OTHER_PERSON)

@@ -89,7 +89,7 @@ def run(
         covariances = fit_covariances(model, fit)
         return fit, covariances, fit.shared_estimate(seen.sequence, covariances.shared)
 
-    fit, covariances, shared = fit_with(earlier)
+    fit, covariances, shared = fit_with(None)
     shape_note = {}
     if earlier is not None and earlier.contradicts(shared):
         shape_note["shape_note"] = (
@@ -97,7 +97,8 @@ def run(
             "was not used; check that both show the same person and have keypoints of the same "
             "detector"
         )
-        fit, covariances, shared = fit_with(None)
+    elif earlier is not None:
+        fit, covariances, shared = fit_with(earlier)
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body
