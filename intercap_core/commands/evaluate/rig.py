@@ -1,7 +1,11 @@
-"""Part ``rig`` of `intercap dev evaluate`: camera poses found without a calibration."""
+"""Part ``rig`` of `intercap dev evaluate`: camera poses found without a calibration.
+
+All stages run twice on recordings with depth and an object: with the given and the found poses.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,9 +26,13 @@ from intercap_core.commands.evaluate.part import (
     with_spread,
 )
 from intercap_core.errors import UserError
-from intercap_core.evaluation.rig_errors import RigErrors, figures, pose_errors
+from intercap_core.evaluation.rig_errors import ChainErrors, RigErrors, figures, pose_errors
 from intercap_core.formats.calibration.boards import parse_board
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
+from intercap_core.geometry.camera.rig import Rig
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
+from intercap_core.stage_list import STAGES
 from intercap_core.studio.board import write_board_recording
 from intercap_core.studio.stage import StudioStage
 
@@ -85,7 +93,31 @@ def _errors(
     poses = found.rig.master_from_colour
     errors = pose_errors(truth_of(project, sequence), found.rig.names, poses)
     sigma = np.array([found.sigma_m(c) for c in range(1, len(found.rig))])
-    return RigErrors(sequence, evidence, errors, sigma)
+    rig = RigErrors(sequence, evidence, errors, sigma)
+    if not (project.captures[sequence].depth and project.sequences[sequence].object):
+        return rig
+    try:
+        return dataclasses.replace(rig, chain=_chain_errors(project, sequence, found.rig))
+    except UserError as error:
+        return dataclasses.replace(rig, problem=str(error))
+
+
+def _chain_errors(project: Project, sequence: str, rig: Rig) -> ChainErrors:
+    """Run all stages to ``joint`` with the given poses and with those of ``rig``."""
+    config = project.config.model_copy(update={"results": project.results, "dataset": "found"})
+    path = config.results / "found" / f"{sequence}.json"
+    path.parent.mkdir(exist_ok=True)
+    by_name = dict(zip(rig.names, rig.master_from_colour, strict=True))
+    write_rig_file(path, Extrinsics(rig.names[0], by_name))
+    row = project.sequences[sequence].model_copy(update={"calibration": path})
+    with_found = dataclasses.replace(project, config=config, sequences={sequence: row})
+    stages = list(STAGES)
+    for stage in stages[: stages.index("joint") + 1]:
+        for some in (project, with_found):
+            run_step(stage, some, sequence, keep=True)
+    given, found = (some.paths(sequence) for some in (project, with_found))
+    truth = truth_of(project, sequence)
+    return ChainErrors.measure(given, found, truth, project.models(sequence))
 
 
 Rigs = Measured[list[RigErrors]]
@@ -107,8 +139,9 @@ def print_rigs(evaluations: Sequence[Rigs]) -> None:
     """Print a table with a row per calibration."""
     console = standard_console()
     table = ListTable(
-        "recording", "by", "error mm", "worst", "estimated", "", title="poses without a calibration"
-    )
+        "recording", "by", "error mm", "worst", "estimated", "body mm", "object mm", "",
+        title="poses without a calibration; all stages with given > found poses",
+    )  # fmt: skip
     for found in evaluations:
         for rig in (rig for recording in found.errors for rig in recording):
             error, sigma = 1e3 * rig.error, 1e3 * rig.sigma
@@ -117,6 +150,8 @@ def print_rigs(evaluations: Sequence[Rigs]) -> None:
                 if len(error)
                 else [""] * 3
             )
+            chain = ("", "") if rig.chain is None else (rig.chain.body, rig.chain.object_)
+            cells += [" > ".join(number(1e3 * float(v), 1) for v in both) for both in chain]
             table.add_row(rig.sequence, rig.evidence, *cells, rig.problem)
     console.print(table)
 
@@ -125,7 +160,7 @@ PART = EvaluationPart(
     name="rig",
     stage="detections",
     settings=config_files("rig", "config"),
-    budget_minutes=4.0,
+    budget_minutes=6.5,
     measure=measure,
     flat=flat,
     print_tables=print_rigs,
