@@ -85,9 +85,11 @@ def record(path: Path, meshes: list[trimesh.Trimesh], poses: np.ndarray, cameras
     wrong = rigid(np.eye(3), np.array([5.0, 0, 0]))  # the calibration's pose means nothing
     rig = Rig(tuple(Camera(f"k{c + 1}", LENS, LENS, np.eye(4), wrong) for c in range(cameras)))
     path.parent.mkdir(parents=True, exist_ok=True)
+    no_colour = np.full((len(poses), cameras), -1)
     write_frames(
-        path, rig, num_sets=len(poses), depths=[np.stack(images)] * cameras, sequence="walk"
-    )
+        path, rig, num_sets=len(poses), depths=[np.stack(images)] * cameras,
+        colour_index=no_colour, sequence="walk",
+    )  # fmt: skip
     return rig
 
 
