@@ -1,12 +1,15 @@
 """`intercap calibrate` on public recordings, compared with the calibrations of their authors.
 
     python -m bench.real_rigs pose2sim CLONE
+    python -m bench.real_rigs azure_kinect CLONE
 
 CLONE is a git clone with its history. Files are extracted into ``results/real_rigs``.
 
 - ``pose2sim``: demonstration of github.com/perfanalytics/pose2sim. Four cameras without depth; a
   person walks on a beam, another person stands in the background. OpenPose's keypoints (BODY_25B)
   are those of release v0.4.0, lenses and reference poses those of Qualisys.
+- ``azure_kinect``: example of github.com/microsoft/Azure-Kinect-Sensor-SDK. 30 colour images of a
+  ChArUco board; the first was taken together with an infrared image.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.project import load_project
 
 SEQUENCE = "take"
+KINECT_BOARD = "charuco:14x9:0.04:0.03:5X5_250"  # PlaneFiles/plane.json
 
 
 def pose2sim(clone: Path, folder: Path) -> None:
@@ -48,9 +52,33 @@ def pose2sim(clone: Path, folder: Path) -> None:
         lenses[name] = _lens_entry(camera.colour) | {
             "image_size": [int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), camera.colour.height]
         }
-    _write_project(folder)
-    found = _calibrate(folder, {"cameras": lenses})
+    _write_project(folder, keypoints=True)
+    found = _calibrate(folder, {"cameras": lenses}, board=None)
     _print_differences(found, reference)
+
+
+def azure_kinect(clone: Path, folder: Path) -> None:
+    """Find the lens of the colour camera and the pose of the infrared one by the board."""
+    _extract(clone, "HEAD", folder / "theirs", "examples/calibration_registration")
+    theirs = folder / "theirs" / "examples" / "calibration_registration" / "example_files"
+    colour, infrared = (folder / "recordings" / name for name in ("colour", "infrared"))
+    colour.mkdir(parents=True)
+    infrared.mkdir()
+    for number in range(30):
+        shutil.copy(theirs / f"calibration/color-{number}.jpg", colour / f"{number:03d}.jpg")
+    shutil.copy(theirs / "registration" / "ir-0.png", infrared / "000.png")
+    lens = _read_lens(theirs / "registration" / "calib_ir.yml")
+    _write_project(folder, keypoints=False)
+    found = read_calibration(
+        _calibrate(folder, {"fps": 1, "cameras": {"infrared": lens}}, board=KINECT_BOARD)
+    )
+    estimated = found.cameras["colour"].colour.matrix
+    known = np.array(_read_lens(theirs / "calibration" / "calib.yml")["camera_matrix"])
+    for name, at in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2))):
+        print(f"{name}: {estimated[at]:.1f} px, theirs {known[at]:.1f}")
+    pose = found.extrinsics.master_from_colour["infrared"]
+    turn = np.degrees(Rotation.from_matrix(pose[:3, :3]).magnitude())
+    print(f"infrared: {1e3 * np.round(pose[:3, 3], 5)} mm from the colour lens, {turn:.2f} degrees")
 
 
 def _extract(clone: Path, revision: str, folder: Path, path: str) -> None:
@@ -68,7 +96,18 @@ def _lens_entry(lens: Intrinsics) -> dict[str, Any]:
     }
 
 
-def _write_project(folder: Path) -> None:
+def _read_lens(path: Path) -> dict[str, Any]:
+    """A lens of the Azure Kinect's example as an entry of a calibration in OpenCV's terms."""
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    fields = {"image_size": "img_size", "camera_matrix": "K", "distortion_coefficients": "dist"}
+    found = {field: file.getNode(name).mat() for field, name in fields.items()}
+    return {
+        field: (value if field == "camera_matrix" else value.ravel()).tolist()
+        for field, value in found.items()
+    }
+
+
+def _write_project(folder: Path, *, keypoints: bool) -> None:
     """Write settings and tables of a project with one plain recording."""
     (folder / "config.yaml").write_text("dataset: real\nresults: results\n")
     (folder / "objects.yaml").write_text("{}\n")
@@ -76,16 +115,16 @@ def _write_project(folder: Path) -> None:
     row = {
         "sequence": SEQUENCE, "subject": "person", "object": "", "layout": "plain",
         "recordings": "recordings", "calibration": "rig.json",
-        "keypoints": "keypoints",
+        "keypoints": "keypoints" if keypoints else "",
     }  # fmt: skip
     (folder / "sequences.tsv").write_text("\t".join(row) + "\n" + "\t".join(row.values()) + "\n")
 
 
-def _calibrate(folder: Path, lenses: dict[str, Any]) -> Path:
+def _calibrate(folder: Path, lenses: dict[str, Any], *, board: str | None) -> Path:
     path = folder / "lenses.json"
     path.write_text(json.dumps(lenses, indent=1))
     found, _ = calibrate(
-        load_project(folder / "config.yaml"), SEQUENCE, output=None, lenses=path, board=None,
+        load_project(folder / "config.yaml"), SEQUENCE, output=None, lenses=path, board=board,
         recordings=[], distance=None, master=None, replace=False,
     )  # fmt: skip
     return found
@@ -110,7 +149,7 @@ def _print_differences(found: Path, reference: Path) -> None:
     print(f"scale of the reference over ours: {scale:.3f}")
 
 
-DATA = {"pose2sim": pose2sim}
+DATA = {"pose2sim": pose2sim, "azure_kinect": azure_kinect}
 
 
 def main() -> None:
