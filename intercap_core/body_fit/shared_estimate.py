@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from intercap_core import artefacts
 from intercap_core.body.loading import ShapePrior
@@ -105,4 +105,4 @@ class SharedEstimate:
         shape = slice(len(self.betas))
         away = alone.betas - self.betas
         both = (self.covariance + alone.covariance)[shape, shape]
-        return bool(chi2.sf(away @ np.linalg.solve(both, away), len(away)) < OTHER_PERSON)
+        return bool(chdtrc(len(away), away @ np.linalg.solve(both, away)) < OTHER_PERSON)

@@ -144,7 +144,7 @@ def test_an_existing_calibration_is_kept(walk: PlainProject, tmp_path: Path) -> 
 def test_layouts_with_poses_are_refused(walk: PlainProject, tmp_path: Path, layout: str) -> None:
     other = PlainProject(tmp_path).write(layout=layout, keypoints=False)
     shutil.copytree(walk.recordings, other.recordings)
-    refuse(other, layout, "k4a or plain", lenses=None)
+    refuse(other, layout, "k4a, ros or plain", lenses=None)
 
 
 def walking_people() -> np.ndarray:

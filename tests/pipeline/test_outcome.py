@@ -17,6 +17,7 @@ from intercap_core.commands.closing import print_remarks, remarks
 from intercap_core.commands.inspect import print_summary
 from intercap_core.errors import UserError
 from intercap_core.flags import OF_OBJECT, PARTS
+from intercap_core.output.export import parameters
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
 from intercap_core.pipeline.step import run_step
@@ -220,7 +221,7 @@ def test_an_export_that_fails_leaves_the_earlier_one_and_a_new_one_replaces_it(
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(export.parameters, "write_intercap", full)
+        patch.setattr(parameters, "write_intercap", full)
         with pytest.raises(OSError, match="no space"):
             run_step("export", project, "s01", output=out)
     assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]
