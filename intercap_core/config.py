@@ -354,7 +354,7 @@ class StudioCapture(Model):
     look: Literal["random", "mesh", "plain", "printed"] = "random"
     """Colours of the object: of its mesh, one plain colour, or a print unknown to the mesh."""
     camera: Literal["rig", "hand_held"] = "rig"
-    """hand_held = nobody is in view, and one camera is carried around the object at rest."""
+    """hand_held = one camera is carried around the object at rest, and no person is in view."""
     layout: LayoutName = "k4a"
     """Layout of the recordings, as in the table of sequences."""
     depth: bool = True

@@ -163,7 +163,7 @@ class Fitter:
         base = self.model.zeros(len(self.frames)).vector()
         offsets, u = self.definition.offsets, np.zeros(len(COVERINGS))
         if self.earlier:
-            offsets, u = self.earlier.offsets, self.earlier.u
+            offsets, u = self.earlier.offsets, self.earlier.covering
         problem = self._problem(
             base=base,
             columns=columns_of(self.model, hands=False, face=False, betas=not self.one_shape),

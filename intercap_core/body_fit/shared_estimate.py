@@ -36,10 +36,10 @@ class SharedEstimate:
     """(S,) in units of the subject's prior; S = 0 if each frame has its own."""
     offsets: np.ndarray
     """(25, 3) keypoint offsets, metres."""
-    u: np.ndarray
+    covering: np.ndarray
     """(G,) logarithms of the thickness of the coverings over the usual one."""
     covariance: np.ndarray
-    """(m, m)"""
+    """(m, m) of the parameters in this order, in their units."""
 
     @classmethod
     def read(
@@ -87,8 +87,8 @@ class SharedEstimate:
 
     @property
     def mean(self) -> np.ndarray:
-        """(m,)"""
-        return np.concatenate([self.betas, self.offsets.ravel(), self.u])
+        """(m,) all parameters: betas, offsets in metres, coverings."""
+        return np.concatenate([self.betas, self.offsets.ravel(), self.covering])
 
     @cached_property
     def precision(self) -> np.ndarray:
@@ -99,8 +99,8 @@ class SharedEstimate:
         """Whether the shape of a fit without this prior is that of another person.
 
         The squared Mahalanobis distance of the betas is chi-square distributed if both estimates
-        are of one person. A fit with the prior cannot tell: it takes observations that the prior
-        contradicts for outliers.
+        are of one person. A fit with the prior does not show it: observations that contradict the
+        prior are outliers there.
         """
         shape = slice(len(self.betas))
         away = alone.betas - self.betas

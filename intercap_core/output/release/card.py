@@ -12,10 +12,8 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
 
@@ -28,13 +26,12 @@ from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.flags import PARTS
 from intercap_core.output.export.registry import formats as export_formats
-from intercap_core.output.release.datasheet import statements
+from intercap_core.output.release.datasheet import statements, text_templates
 from intercap_core.output.site.measures import covered
 from intercap_core.versions import versions
 
 Facts = dict[str, Any]
 
-_TEMPLATES = Path(__file__).parent / "data"
 _NUMBER = re.compile(r"\d+(\.\d+)?")  # replaced in reasons, which are counted without numbers
 _MARKUP = re.compile(r"[\\`*\[\]!]")  # characters that begin markup within a line of Markdown
 _HUB_LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]*")  # identifiers of licences on hubs
@@ -159,13 +156,7 @@ def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) ->
 
 def markdown(card: Facts) -> str:
     """Return the card as Markdown, with the header that dataset hubs read."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATES),
-        autoescape=False,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = text_templates()
     environment.filters["plain"] = _escape
     frames = card["counts"]["frames"]
     size = next((name for most, name in _SIZES if frames < most), "n>10M")

@@ -59,21 +59,27 @@ def statements(settings: CardSettings, *, virtual: bool) -> dict[str, str]:
     }
 
 
-def datasheet(card: Facts) -> str:
-    """Return the datasheet as Markdown; missing statements are placeholders with their question."""
-    environment = jinja2.Environment(
+def text_templates() -> jinja2.Environment:
+    """Return the environment of this package's Markdown templates."""
+    return jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "data"),
         autoescape=False,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def datasheet(card: Facts) -> str:
+    """Return the datasheet as Markdown; missing statements are placeholders with their question."""
     stated = {
         name: text or f"**Not stated.** {STATEMENTS[name].question} (setting `card.{name}`)"
         for name, text in card["statements"].items()
     }
-    return environment.get_template("datasheet.md.j2").render(
-        card=card, stated=stated, limitations=_limitations(card)
+    return (
+        text_templates()
+        .get_template("datasheet.md.j2")
+        .render(card=card, stated=stated, limitations=_limitations(card))
     )
 
 
