@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
-from intercap_core.formats.calibration.opencv import read_content
+from intercap_core.formats.calibration.opencv import read_content, states_lenses
 from intercap_core.formats.recordings import k4a, plain
 from intercap_core.formats.recordings.ros import layout as ros
 
@@ -67,9 +67,11 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
             f"{row.recordings}: holds recordings of camera {names[0]!r} only, expected two cameras "
             "or more; one camera needs no poses: write its lens with R and T zero"
         )
-    if row.layout != "plain":  # the recordings hold the lenses
-        return RigDraft(_ordered(names, master, row.recordings), None, frozenset())
     source = lenses or (row.calibration if row.calibration.exists() else None)
+    is_plain = row.layout == "plain"
+    # Bags without CameraInfo need a stated lens; all other recordings hold the lenses.
+    if not is_plain and (row.layout == "k4a" or source is None or not states_lenses(source)):
+        return RigDraft(_ordered(names, master, row.recordings), None, frozenset())
     content = _read_lenses(source)
     entries = {name: dict(content["cameras"].get(name) or {}) for name in names}
     first = master or content.get("master")
@@ -79,7 +81,7 @@ def draft_rig(row: SequenceEntry, lenses: Path | None, master: str | None) -> Ri
             entry.pop(field, None)
         if "image_width" in entry and "image_height" in entry:
             entry["image_size"] = [entry.pop("image_width"), entry.pop("image_height")]
-        if "image_size" not in entry:
+        if "image_size" not in entry and is_plain:
             entry["image_size"] = _image_size(row.recordings, name)
     without = frozenset(n for n in names if any(f not in entries[n] for f in _LENS_FIELDS))
     content |= {"master": names[0], "cameras": {name: entries[name] for name in names}}

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from intercap_core.errors import MissingPackage
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.capture_folder import CameraFiles, CaptureFolder, Device, DeviceFrame
 
 WORLD = "world"  # frame of the master
@@ -32,7 +34,7 @@ class RosFolder(CaptureFolder):
 
 
 class _RosBag(CameraFiles):
-    """One bag: JPEG colour, PNG depth in the depth camera's lens, lenses and poses."""
+    """One bag: JPEG colour, PNG depth in its own lens, inertial samples, lenses and poses."""
 
     def __init__(self, path: Path, device: Device) -> None:
         try:
@@ -51,9 +53,11 @@ class _RosBag(CameraFiles):
         self._name, start = name, device.first_us * 1000
         poses = {f"{name}_color": (WORLD, camera.master_from_colour)}
         self._write_lens("color", camera.colour, start)
+        assert camera.depth is not None and camera.colour_from_depth is not None
+        poses[f"{name}_depth"] = (f"{name}_color", camera.colour_from_depth)
+        from_accelerometer = rigid(ACCELEROMETER_FROM_DEPTH.T, np.zeros(3))
+        poses[f"{name}_imu"] = (f"{name}_depth", from_accelerometer)
         if device.depth:
-            assert camera.depth is not None and camera.colour_from_depth is not None
-            poses[f"{name}_depth"] = (f"{name}_color", camera.colour_from_depth)
             self._write_lens("depth", camera.depth, start)
         transforms = [
             self._make(
@@ -74,6 +78,19 @@ class _RosBag(CameraFiles):
             packed = cv2.imencode(".png", frame.depth, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             content = bytes(12) + packed.tobytes()
             self._write_image("depth", "Depth", "16UC1; compressedDepth png", content, time_ns)
+        unknown = np.zeros(9)
+        for acceleration, rate, time_us in frame.inertial:
+            self._write(
+                f"/{self._name}/imu",
+                "sensor_msgs/msg/Imu",
+                time_us * 1000,
+                header=self._header(f"{self._name}_imu", time_us * 1000),
+                orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+                orientation_covariance=np.array([-1.0, *unknown[1:]]),  # no orientation
+                angular_velocity=self._vector(rate), angular_velocity_covariance=unknown,
+                linear_acceleration=self._vector(acceleration),
+                linear_acceleration_covariance=unknown,
+            )  # fmt: skip
 
     def close(self) -> None:
         """Finish the bag."""
@@ -108,12 +125,15 @@ class _RosBag(CameraFiles):
 
     def _transform(self, pose: np.ndarray) -> Any:
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        place = dict(zip("xyz", map(float, pose[:3, 3]), strict=True))
         return self._make(
             "geometry_msgs/msg/Transform",
-            translation=self._make("geometry_msgs/msg/Vector3", **place),
+            translation=self._vector(pose[:3, 3]),
             rotation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
         )
+
+    def _vector(self, values: np.ndarray) -> Any:
+        x, y, z = map(float, values)
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def _header(self, frame: str, at: int) -> Any:
         seconds, nanoseconds = divmod(at, 1_000_000_000)

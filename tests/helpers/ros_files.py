@@ -92,6 +92,19 @@ class BagFile:
         self.add(topic, "sensor_msgs/msg/CompressedImage", at, header=self.header(at, frame),
                  format=text, data=np.frombuffer(content, np.uint8))  # fmt: skip
 
+    def inertial(self, topic: str, at: int, frame: str, acceleration: np.ndarray,
+                 extra: bytes = b"") -> None:  # fmt: skip
+        """Add an Imu with an acceleration (3,), m/s^2, and without a rate."""
+        x, y, z = np.asarray(acceleration, float).tolist()
+        nothing = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        turn = self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        names = ("orientation", "angular_velocity", "linear_acceleration")
+        zeros = {f"{name}_covariance": np.zeros(9) for name in names}
+        self.add(topic, "sensor_msgs/msg/Imu", at, extra, header=self.header(at, frame),
+                 orientation=turn, angular_velocity=nothing,
+                 linear_acceleration=self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                 **zeros)  # fmt: skip
+
     def transforms(self, **poses: tuple[str, np.ndarray]) -> None:
         """Add static transforms: parent and pose (4, 4) by the child's frame."""
         stamped = []
@@ -183,6 +196,7 @@ def rig_file(folder: Path, *names: str) -> Path:
     return path
 
 
+DOWN = np.array([0.2, 0.9, -0.3]) / np.linalg.norm([0.2, 0.9, -0.3])  # of a tilted camera
 COLOUR_FROM_DEPTH = pose(0.02, 0.032, 0.001, -0.002)
 
 

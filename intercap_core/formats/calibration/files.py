@@ -19,12 +19,14 @@ from intercap_core.formats.calibration.extrinsics import (
     MAX_DISTANCE_M,
     check_camera_name,
     list_names,
+    read_extrinsics,
     relate_to_master,
 )
 from intercap_core.formats.calibration.opencv import (
     CalibratedCamera,
     Calibration,
     read_opencv_calibration,
+    states_lenses,
 )
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert, rotation_log
@@ -105,6 +107,20 @@ def read_tool_calibration(
         raise UserError(f"{path}: is a part of a calibration; name its folder, {path.parent}")
     reader = next((reader for reader in calibration_readers() if reader.recognises(path)), None)
     return None if reader is None else reader.read(path, recorded, scale)
+
+
+def read_poses(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
+    """Read the poses of recordings that hold their lenses, and the lenses that ``path`` states.
+
+    Rig files and the folders of :func:`read_extrinsics` state none: ``cameras`` is then empty.
+    """
+    other = read_tool_calibration(path, recorded, scale)
+    if other is not None:
+        return other
+    refuse_scale(path, scale)
+    if states_lenses(path):
+        return read_opencv_calibration(path)
+    return Calibration({}, read_extrinsics(path))
 
 
 def only_file(path: Path, files: Sequence[Path]) -> Path:

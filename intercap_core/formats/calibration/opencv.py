@@ -111,6 +111,16 @@ def read_content(path: Path) -> dict[str, Any]:
     return {"cameras": {file.stem: load_opencv(file) for file in files}}
 
 
+def states_lenses(path: Path) -> bool:
+    """Whether a file or folder is a calibration in OpenCV's terms, with the lens of a camera."""
+    try:
+        entries = read_content(path).get("cameras")
+    except UserError:
+        return False
+    every = entries.values() if isinstance(entries, dict) else ()
+    return any(isinstance(entry, dict) and "camera_matrix" in entry for entry in every)
+
+
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
     """Make a lens of ``size`` (width, height) from a matrix (3, 3) and 4, 5 or 8 coefficients.
 

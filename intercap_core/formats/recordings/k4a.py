@@ -24,12 +24,7 @@ from av.stream import Discard
 
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.files import (
-    RecordedCameras,
-    read_tool_calibration,
-    refuse_scale,
-)
+from intercap_core.formats.calibration.files import RecordedCameras, read_poses
 from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
@@ -39,6 +34,7 @@ from intercap_core.formats.calibration.k4a import (
 from intercap_core.formats.calibration.opencv import check_rate
 from intercap_core.formats.recordings import encodings, video
 from intercap_core.formats.recordings.source import (
+    Accelerometer,
     CameraRecording,
     ClosedOnExit,
     Image,
@@ -354,10 +350,7 @@ class KinectLayout(RecordingLayout):
                 )
         self.names = list(self._paths)
         path, scale = sequence.calibration, sequence.calibration_scale
-        other = read_tool_calibration(path, RecordedCameras(self.names), scale)
-        if other is None:
-            refuse_scale(path, scale)
-        self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics
+        self.extrinsics = read_poses(path, RecordedCameras(self.names), scale).extrinsics
 
     def open(self, name: str) -> KinectRecording:
         """Open ``<name>.mkv``; raises UserError as :class:`KinectFile` does."""
@@ -396,12 +389,10 @@ class KinectRecording(CameraRecording):
         """
         info = self._recording.info
         counts = {"colour": 0, "depth": 0}
-        acceleration, samples = np.zeros(3), 0
+        accelerometer = Accelerometer()
         for packet in self._recording.packets():
             if packet.kind == "imu":
-                values = parse_imu_samples(packet.content)[:, :3]
-                acceleration += values.sum(axis=0)
-                samples += len(values)
+                accelerometer.add(parse_imu_samples(packet.content)[:, :3])
                 continue
             counts[packet.kind] += 1
             content: bytes | np.ndarray = packet.content
@@ -426,6 +417,6 @@ class KinectRecording(CameraRecording):
         if self._recording.broken_packets:
             self.notes.append(f"{self._recording.broken_packets} damaged packets left out")
         rotation = self._recording.colour_from_accelerometer()
-        if samples and rotation is not None and np.linalg.norm(acceleration) > 0:
-            # At rest the accelerometer measures the floor's reaction, which is up.
-            self.gravity = rotation @ (-acceleration / np.linalg.norm(acceleration))
+        if rotation is not None:
+            self.gravity, note = accelerometer.gravity(rotation)
+            self.notes += [note] if note else []

@@ -20,6 +20,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics
 from intercap_core.geometry.camera.rig import Camera
 
+GRAVITY = 9.80665  # m/s^2, standard (ISO 80000-3)
 SOUND_RATE = 8000  # samples a second, that of telephony: steps and voices are within 4 kHz
 
 
@@ -63,6 +64,30 @@ class Image(NamedTuple):
     content: bytes | np.ndarray
     """Colour: a whole JPEG or PNG file without an orientation. Depth: (H, W) uint16 in the size of
     the depth lens, mm, 0 = invalid."""
+
+
+class Accelerometer:
+    """Sum of the samples of an accelerometer, from which the direction of gravity follows."""
+
+    def __init__(self) -> None:
+        self._sum, self._count = np.zeros(3), 0
+
+    def add(self, samples: np.ndarray) -> None:
+        """Add accelerations (n, 3), m/s^2."""
+        self._sum += samples.sum(axis=0)
+        self._count += len(samples)
+
+    def gravity(self, colour_from_sensor: np.ndarray) -> tuple[np.ndarray, str]:
+        """Direction down (3,), unit, in the frame that ``colour_from_sensor`` (3, 3) rotates to.
+
+        NaN and a note if the mean is not gravity, as of drivers that subtract it; the note follows
+        the camera's name. At rest an accelerometer measures the floor's reaction, which is up.
+        """
+        length = float(np.linalg.norm(self._sum)) / max(self._count, 1)
+        if self._count and abs(length / GRAVITY - 1) < 0.2:  # devices in use are within 3 %
+            return colour_from_sensor @ (-self._sum / np.linalg.norm(self._sum)), ""
+        note = f"its accelerometer measures {length:.2g} m/s^2 in the mean, expected {GRAVITY:.1f}"
+        return np.full(3, np.nan), f"{note}: gravity is not used" if self._count else ""
 
 
 class ClosedOnExit(AbstractContextManager[Any]):

@@ -34,6 +34,11 @@ _ROS1_TYPES = {
         "float32[3] translationMatrix\nuint16 width\nuint16 height\nuint16 fps\n"
         "float32[4] cameraIntrinsic\nfloat32[8] cameraDistortion\nuint8 distortionModel\n"
     ),
+    "custom_msg/msg/OBImuStreamProfileInfo": (
+        "std_msgs/Header header\nuint8 streamType\nuint8 format\nuint8 accelFullScaleRange\n"
+        "uint8 accelSampleRate\nuint8 gyroFullScaleRange\nuint8 gyroSampleRate\n"
+        "float32[9] rotationMatrix\nfloat32[3] translationMatrix\n"
+    ),
     "custom_msg/msg/OBDeviceInfo": (
         "std_msgs/Header header\nstring name\nstring fullName\nstring asicName\nuint16 vid\n"
         "uint16 pid\nstring uid\nstring sn\n"

@@ -17,24 +17,26 @@ import numpy as np
 
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import MissingPackage, UserError
-from intercap_core.formats.calibration.extrinsics import (
-    Extrinsics,
-    check_camera_name,
-    read_extrinsics,
-)
+from intercap_core.formats.calibration.extrinsics import Extrinsics, check_camera_name
 from intercap_core.formats.calibration.files import (
     RecordedCameras,
-    read_tool_calibration,
+    read_poses,
     refuse_scale,
 )
-from intercap_core.formats.calibration.opencv import check_rate
+from intercap_core.formats.calibration.opencv import CalibratedCamera, check_rate
 from intercap_core.formats.recordings.encodings import DamagedImage, encoded_size
 from intercap_core.formats.recordings.ros import orbbec, realsense, standard
 from intercap_core.formats.recordings.ros.bag import Bag, find_bags, is_bag
 from intercap_core.formats.recordings.ros.images import decode_colour, decode_depth
 from intercap_core.formats.recordings.ros.lenses import STATIC_TRANSFORMS, StaticTransforms
-from intercap_core.formats.recordings.ros.streams import CameraStreams, Scheme, Stream
+from intercap_core.formats.recordings.ros.streams import (
+    CameraStreams,
+    Scheme,
+    Stream,
+    acceleration,
+)
 from intercap_core.formats.recordings.source import (
+    Accelerometer,
     CameraRecording,
     Image,
     RecordingLayout,
@@ -107,22 +109,22 @@ class RosLayout(RecordingLayout):
     """The bags in a folder, or a folder that is a bag of ROS 2.
 
     Poses are those of static transforms if ``calibration`` is a bag or the folder of the
-    recordings, else those of a rig file or of another tool. Lenses are those in the bags.
+    recordings, else those of a rig file or of another calibration. Lenses are those in the bags,
+    else those of the calibration.
     """
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
         self._places = _find_places(sequence.recordings)
         self.names = sorted(self._places)
+        self._known: dict[str, CalibratedCamera] = {}
         path, scale = sequence.calibration, sequence.calibration_scale
         if is_bag(path) or path == sequence.recordings:
             refuse_scale(path, scale)
             self.extrinsics = self._static_poses(path)
             return
-        other = read_tool_calibration(path, RecordedCameras(self.names), scale)
-        if other is None:
-            refuse_scale(path, scale)
-        self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics
+        calibration = read_poses(path, RecordedCameras(self.names), scale)
+        self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
 
     def _static_poses(self, path: Path) -> Extrinsics:
         """Poses of all cameras; raises UserError if one of them cannot be read."""
@@ -135,7 +137,7 @@ class RosLayout(RecordingLayout):
         with contextlib.ExitStack() as opened:
             bags = {path: opened.enter_context(Bag(path)) for path in sorted(paths)}
             frames = {
-                name: self._streams(bags[place.path], place).frame
+                name: self._streams(bags[place.path], name).frame
                 for name, place in sorted(self._places.items())
             }
             transforms = StaticTransforms(bags.values())
@@ -146,8 +148,9 @@ class RosLayout(RecordingLayout):
             )
         return transforms.extrinsics(path, frames)
 
-    def _streams(self, bag: Bag, place: _Place) -> CameraStreams:
-        return _scheme_of(bag).read(bag, place.name, (self.sequence.topics or "").split())
+    def _streams(self, bag: Bag, name: str) -> CameraStreams:
+        preferred = (self.sequence.topics or "").split()
+        return _scheme_of(bag).read(bag, self._places[name].name, preferred, self._known.get(name))
 
     def open(self, name: str) -> CameraRecording:
         """Open the camera's streams.
@@ -159,7 +162,7 @@ class RosLayout(RecordingLayout):
             raise UserError(place.fault)
         bag = Bag(place.path)
         try:
-            streams = self._streams(bag, place)
+            streams = self._streams(bag, name)
             return RosRecording(bag, streams, name, self.extrinsics)
         except BaseException:
             bag.close()
@@ -210,8 +213,12 @@ class RosRecording(CameraRecording):
         streams = {s.topic: s for s in (self._streams.colour, self._streams.depth) if s is not None}
         remarks: Counter[str] = Counter()
         last_ns: dict[str, int] = {}
-        damaged = 0
-        for topic, recorded, message in self._bag.messages(*streams):
+        damaged, accelerometer = 0, Accelerometer()
+        inertial = self._streams.accelerometer
+        for topic, recorded, message in self._bag.messages(*streams, *[inertial] * bool(inertial)):
+            if topic == inertial:
+                accelerometer.add(acceleration(message)[None])
+                continue
             stream, last_ns[topic] = streams[topic], recorded
             time_us = _time_us(stream, recorded, message)
             if stream is self._streams.depth:
@@ -229,6 +236,12 @@ class RosRecording(CameraRecording):
         if damaged:
             self.notes.append(f"{damaged} damaged depth images left out")
         self._note_stop(last_ns)
+        rotation, note = self._streams.colour_from_accelerometer, ""
+        if rotation is not None:
+            self.gravity, note = accelerometer.gravity(rotation)
+        elif inertial:
+            note = f"no pose of its accelerometer ({inertial}) is recorded: gravity is not used"
+        self.notes += [note] if note else []
 
     def _note_stop(self, last_ns: dict[str, int]) -> None:
         """Note a topic that stops before the other one."""

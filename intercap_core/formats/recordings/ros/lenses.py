@@ -38,11 +38,7 @@ def read_lens(info: Any, where: str, *, rectified: bool = False) -> Intrinsics:
         where: bag and topic.
         rectified: whether the images were rectified, so that the projection matrix holds.
     """
-    # ROS 1 names the fields in capitals.
-    matrix, coefficients, projection = (
-        np.asarray(getattr(info, name, getattr(info, name.upper(), None)), np.float64)
-        for name in ("k", "d", "p")
-    )
+    matrix, coefficients, projection = (_numbers(info, name) for name in ("k", "d", "p"))
     model = str(info.distortion_model).strip()
     size = (int(info.width), int(info.height))
     if rectified and projection[0] > 0:
@@ -56,6 +52,16 @@ def read_lens(info: Any, where: str, *, rectified: bool = False) -> Intrinsics:
     if no_distortion:
         coefficients = np.zeros(4)
     return opencv_lens(size, matrix.reshape(3, 3), coefficients, where)
+
+
+def states_lens(info: Any) -> bool:
+    """Whether a CameraInfo message states a lens; drivers of uncalibrated cameras write zeros."""
+    return bool(_numbers(info, "k").any() or _numbers(info, "p").any())
+
+
+def _numbers(info: Any, name: str) -> np.ndarray:
+    """A field of a CameraInfo message; ROS 1 names it in capitals."""
+    return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), np.float64)
 
 
 class StaticTransforms:

@@ -7,12 +7,13 @@ Images are on ``/cam/sensor_<n>/frameType_<n>``, lenses and the pose of the dept
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.opencv import opencv_lens
+from intercap_core.formats.calibration.opencv import CalibratedCamera, opencv_lens
 from intercap_core.formats.recordings.ros.bag import Bag
 from intercap_core.formats.recordings.ros.streams import (
     CameraStreams,
@@ -23,7 +24,11 @@ from intercap_core.formats.recordings.ros.streams import (
 )
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
 
-_COLOUR, _DEPTH = 2, 3  # OBSensorType, OBFrameType and OBStreamType have the same numbers
+_COLOUR, _DEPTH, _ACCELEROMETER = (
+    2,
+    3,
+    4,
+)  # OBSensorType, OBFrameType and OBStreamType have the same numbers
 # OBCameraDistortionModel: none, modified, (plain) and of six coefficients Brown-Conrady. The
 # modified model scales the tangential part too, by less than 0.05 px. Inverse and fisheye models
 # are not OpenCV's.
@@ -32,22 +37,23 @@ _OPENCV_MODELS = (0, 1, 3, 4)
 _ORDER = [0, 1, 6, 7, 2, 3, 4, 5]
 
 
-def _images(stream: int) -> str:
+def _topic(stream: int) -> str:
     return f"/cam/sensor_{stream}/frameType_{stream}"
 
 
-def read(bag: Bag, name: str, preferred: Sequence[str]) -> CameraStreams:
+def read(
+    bag: Bag, name: str, preferred: Sequence[str], known: CalibratedCamera | None
+) -> CameraStreams:
     """Read the streams of the device; raises UserError as the scheme says."""
-    if _images(_COLOUR) not in bag.topics:
+    if _topic(_COLOUR) not in bag.topics:
         raise UserError(f"{bag.path}: was recorded without colour; record with the colour stream")
     colour, _ = _stream(bag, _COLOUR)
     device = bag.first("/cam/deviceInfo")
     serial = "" if device is None else str(device.sn)
-    if _images(_DEPTH) not in bag.topics:
+    if _topic(_DEPTH) not in bag.topics:
         return CameraStreams(colour, None, None, serial=serial)
     depth, profile = _stream(bag, _DEPTH)
-    rotation = np.asarray(profile.rotationMatrix, np.float64).reshape(3, 3)
-    pose = rigid(rotation, np.asarray(profile.translationMatrix, np.float64) * 1e-3)  # of mm
+    pose = _pose(profile)
     if not is_rigid(pose, 1e-3):
         raise UserError(
             f"{bag.path}: the pose of the depth camera is no rigid transform; record colour and "
@@ -55,14 +61,27 @@ def read(bag: Bag, name: str, preferred: Sequence[str]) -> CameraStreams:
         )
     disparity = bag.first("/cam/disparityParam")  # of stereo cameras alone
     baseline_mm = 0.0 if disparity is None else abs(disparity.baseline * disparity.unit)
-    return CameraStreams(
+    streams = CameraStreams(
         colour, depth, pose, serial=serial, stereo_baseline_m=float(baseline_mm) * 1e-3
     )
+    inertial = bag.first(f"/cam/streamProfileType_{_ACCELEROMETER}")
+    if inertial is None or not is_rigid(_pose(inertial), 1e-3):
+        return streams
+    rotation = (pose @ _pose(inertial))[:3, :3]  # the profile's pose is that in the depth camera
+    return replace(
+        streams, accelerometer=_topic(_ACCELEROMETER), colour_from_accelerometer=rotation
+    )
+
+
+def _pose(profile: Any) -> np.ndarray:
+    """Pose (4, 4) that a profile states, metres."""
+    rotation = np.asarray(profile.rotationMatrix, np.float64).reshape(3, 3)
+    return rigid(rotation, np.asarray(profile.translationMatrix, np.float64) * 1e-3)  # of mm
 
 
 def _stream(bag: Bag, number: int) -> tuple[Stream, Any]:
     """A stream and its profile."""
-    topic, where = _images(number), f"/cam/streamProfileType_{number}"
+    topic, where = _topic(number), f"/cam/streamProfileType_{number}"
     kind_of_topic(bag, topic)
     profile = first_or_refuse(bag, where, f"the lens of {topic}")
     distortion = np.asarray(profile.cameraDistortion, np.float64)[_ORDER]
@@ -79,7 +98,7 @@ def _stream(bag: Bag, number: int) -> tuple[Stream, Any]:
 
 SCHEME = Scheme(
     "Orbbec's recorder",
-    lambda bag: _images(_COLOUR) in bag.topics or _images(_DEPTH) in bag.topics,
+    lambda bag: _topic(_COLOUR) in bag.topics or _topic(_DEPTH) in bag.topics,
     lambda bag: [""],
     read,
 )

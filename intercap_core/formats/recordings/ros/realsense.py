@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.opencv import CalibratedCamera
 from intercap_core.formats.recordings.ros.bag import Bag
 from intercap_core.formats.recordings.ros.lenses import read_lens, transform_matrix
 from intercap_core.formats.recordings.ros.streams import (
@@ -32,6 +34,8 @@ _IMAGES = re.compile(
     r"((/device_\d+)/sensor_\d+)/((Color|Depth)_\d+)/image/data(/compressed(Depth)?)?"
 )
 
+_ACCELERATION = re.compile(r"/device_\d+/sensor_\d+/(Accel|Motion)_\d+/imu/data")
+
 
 def list_cameras(bag: Bag) -> list[str]:
     """Names of the devices; "" if there is one, since topics state no name."""
@@ -39,7 +43,9 @@ def list_cameras(bag: Bag) -> list[str]:
     return [""] if len(devices) == 1 else [device.strip("/") for device in devices]
 
 
-def read(bag: Bag, name: str, preferred: Sequence[str]) -> CameraStreams:
+def read(
+    bag: Bag, name: str, preferred: Sequence[str], known: CalibratedCamera | None
+) -> CameraStreams:
     """Read the streams of a device of :func:`list_cameras`; raises UserError as the scheme says."""
     matches = [match for topic in bag.topics if (match := _IMAGES.fullmatch(topic))]
     of_device = [m for m in matches if name in ("", m[2].strip("/"))]
@@ -51,26 +57,30 @@ def read(bag: Bag, name: str, preferred: Sequence[str]) -> CameraStreams:
     device = of_device[0][2]
     colour = _stream(bag, choose_topic(bag, "colour", colour_topics, preferred))
     serial = _text_of(bag, f"{device}/info").get("Serial Number", "")
+    streams = CameraStreams(colour, None, None, serial=serial)
+    inertial = [topic for topic in bag.topics if _ACCELERATION.fullmatch(topic)]
+    for topic in (topic for topic in inertial if topic.startswith(f"{device}/")):
+        pose = _pose_in(bag, colour.topic, topic)
+        rotation = None if pose is None else pose[:3, :3]
+        streams = replace(streams, accelerometer=topic, colour_from_accelerometer=rotation)
     if not depth_topics:
-        return CameraStreams(colour, None, None, serial=serial)
+        return streams
     topic = choose_topic(bag, "depth", depth_topics, preferred)
     match = _IMAGES.fullmatch(topic)
     assert match is not None
     unit = _option(bag, match[1], "Depth_Units")
     depth = _stream(bag, topic, 0.001 if unit is None else unit)
     baseline_mm = _option(bag, match[1], "Stereo_Baseline")
-    reference, colour_from_reference = _pose(bag, colour.topic)
-    other, depth_from_reference = _pose(bag, topic)
-    if reference != other:
+    colour_from_depth = _pose_in(bag, colour.topic, topic)
+    if colour_from_depth is None:
         raise UserError(
             f"{bag.path}: the poses of {colour.topic} and {topic} have no common reference; record "
             "both streams in one recording of one device"
         )
-    return CameraStreams(
-        colour,
-        depth,
-        colour_from_reference @ invert(depth_from_reference),
-        serial=serial,
+    return replace(
+        streams,
+        depth=depth,
+        colour_from_depth=colour_from_depth,
         stereo_baseline_m=abs(baseline_mm or 0.0) * 1e-3,
     )
 
@@ -108,11 +118,24 @@ def _lens_of_text(values: dict[str, str], where: str) -> Any:
     )  # fmt: skip
 
 
+def _pose_in(bag: Bag, colour: str, topic: str) -> np.ndarray | None:
+    """Pose (4, 4) of a stream in the frame of the colour stream; None if it is not recorded."""
+    (reference, colour_from_reference), (other, from_reference) = (
+        _pose(bag, name) for name in (colour, topic)
+    )
+    return colour_from_reference @ invert(from_reference) if reference == other else None
+
+
 def _pose(bag: Bag, topic: str) -> tuple[str, np.ndarray]:
-    """Number of the reference stream, and the pose (4, 4) of the reference in a stream's frame."""
-    prefix = f"{topic.partition('/image/')[0]}/tf/"
-    where = next((name for name in bag.topics if name.startswith(prefix)), f"{prefix}0")
-    message = first_or_refuse(bag, where, f"the pose of {topic}")
+    """Number of the reference stream, and the pose (4, 4) of the reference in a stream's frame.
+
+    Without a recorded pose, the reference is the stream itself.
+    """
+    prefix = f"{'/'.join(topic.split('/')[:4])}/tf/"
+    where = next((name for name in bag.topics if name.startswith(prefix)), "")
+    if not where:
+        return topic, np.eye(4)
+    message = bag.first(where)
     if hasattr(message, "data"):
         values = _pairs(message.data)
         rotation, translation = (
@@ -130,8 +153,12 @@ def _pose(bag: Bag, topic: str) -> tuple[str, np.ndarray]:
 
 
 def _option(bag: Bag, sensor: str, name: str) -> float | None:
-    """Value of an option of a sensor; None if it was not recorded."""
-    message = bag.first(f"{sensor}/option/{name}/value")
+    """Value of an option of a sensor; None if it was not recorded.
+
+    Recorders until the middle of 2019 wrote spaces instead of underscores.
+    """
+    topics = (f"{sensor}/option/{own}/value" for own in (name, name.replace("_", " ")))
+    message = next((bag.first(topic) for topic in topics if topic in bag.topics), None)
     return None if message is None else round(float(message.data), 8)  # of single precision
 
 

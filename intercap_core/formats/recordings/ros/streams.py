@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.opencv import CalibratedCamera
 from intercap_core.formats.recordings.ros.bag import Bag
 from intercap_core.formats.recordings.ros.images import Kind, kind_of
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -19,6 +20,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
+IMU = "sensor_msgs/msg/Imu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,10 @@ class CameraStreams:
     """Serial number of the device; "" = not stated."""
     stereo_baseline_m: float = 0.0
     """Distance of the two infrared lenses of a stereo camera; 0 = time of flight, or not stated."""
+    accelerometer: str = ""
+    """Topic of type :data:`IMU` with accelerations; "" = none."""
+    colour_from_accelerometer: np.ndarray | None = None
+    """Rotation (3, 3); None without accelerometer, or if it is not known."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +68,10 @@ class Scheme:
     """Whether a bag has such topics."""
     list_cameras: Callable[[Bag], list[str]]
     """Names of the cameras with images; "" if the topics state none."""
-    read: Callable[[Bag, str, Sequence[str]], CameraStreams]
-    """Reads the camera of this name. The last argument holds topics that the user prefers. Raises
-    UserError if lenses are missing, or if topics are ambiguous."""
+    read: Callable[[Bag, str, Sequence[str], CalibratedCamera | None], CameraStreams]
+    """Reads the camera of this name. The other arguments are topics that the user prefers, and what
+    the calibration states of the camera, for bags without lenses. Raises UserError if lenses are
+    missing, or if topics are ambiguous."""
 
 
 def choose_topic(bag: Bag, kind: str, topics: Sequence[str], preferred: Sequence[str]) -> str:
@@ -88,6 +95,12 @@ def kind_of_topic(bag: Bag, topic: str) -> Kind:
         return kind_of(bag.first(topic))
     except UserError as error:
         raise UserError(f"{bag.path}: topic {topic} {error}") from None
+
+
+def acceleration(message: Any) -> np.ndarray:
+    """Acceleration (3,), m/s^2, of an :data:`IMU` message; zero in those of gyroscopes."""
+    value = message.linear_acceleration
+    return np.array([value.x, value.y, value.z])
 
 
 def first_or_refuse(bag: Bag, topic: str, purpose: str) -> Any:

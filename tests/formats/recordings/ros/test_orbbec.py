@@ -22,6 +22,7 @@ from tests.helpers.ros_files import (
     COLOUR_SIZE,
     DEPTH_K,
     DEPTH_SIZE,
+    DOWN,
     PERIOD_NS,
     START_NS,
     BagFile,
@@ -57,12 +58,35 @@ int32 invalidDisp
 int32 dispIntPlace
 uint8 isDualCamera
 """
+INERTIAL = """std_msgs/Header header
+uint8 streamType
+uint8 format
+uint8 accelFullScaleRange
+uint8 accelSampleRate
+uint8 gyroFullScaleRange
+uint8 gyroSampleRate
+float32[9] rotationMatrix
+float32[3] translationMatrix
+float64 noiseDensity
+float64 randomWalk
+float64 referenceTemp
+float64[3] bias
+float64[3] gravity
+float64[9] scaleMisalignment
+float64[9] tempSlope
+"""
+# Axes x, y, z of the accelerometer are -z, -x, y of the depth camera.
+DEPTH_FROM_ACCELEROMETER = np.array(
+    [[0.0, -1, 0, 0.004], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
+)
 K1_TO_K6_P1_P2 = (0.1, -0.05, 0.01, 0.2, -0.03, 0.004, 0.001, -0.002)
 
 
 def write(path: Path, *, model: int = 4, profiles: bool = True, disparity: bool = False) -> None:
     with BagFile(path, "bag") as bag:
-        for name, text in (("OBStreamProfileInfo", PROFILE), ("OBDisparityParam", DISPARITY)):
+        texts = {"OBStreamProfileInfo": PROFILE, "OBDisparityParam": DISPARITY,
+                 "OBImuStreamProfileInfo": INERTIAL}  # fmt: skip
+        for name, text in texts.items():
             bag.store.register(get_types_from_msg(text, f"custom_msg/msg/{name}"))
         # depth_units, number, three times, metadata (3 bytes), its size, bits of a pixel
         extra = struct.pack("<fQQQQI3sIB", 0.0, 7, 1, 2, 3, 3, b"abc", 3, 16)
@@ -76,6 +100,7 @@ def write(path: Path, *, model: int = 4, profiles: bool = True, disparity: bool 
         if profiles:
             profile(bag, 2, COLOUR_SIZE, COLOUR_K, model)
             profile(bag, 3, DEPTH_SIZE, DEPTH_K, model)
+        inertial(bag)
         if disparity:
             bag.add("/cam/disparityParam", "custom_msg/msg/OBDisparityParam", START_NS,
                     header=bag.header(START_NS, ""), zpd=0.0, zpps=0.0, baseline=50.0, fx=38.0,
@@ -97,6 +122,24 @@ def profile(bag: BagFile, number: int, size: tuple[int, int], k: np.ndarray, mod
             **{name: value.astype(np.float32) for name, value in values.items()})  # fmt: skip
 
 
+def inertial(bag: BagFile) -> None:
+    """Samples of a device at rest, and the pose of its accelerometer."""
+    up = DEPTH_FROM_ACCELEROMETER[:3, :3].T @ (-9.8 * DOWN)
+    # data, its size, number, temperature, three times
+    extra = struct.pack("<I3sIQfQQQ", 3, b"abc", 3, 7, 25.0, 1, 2, 3)
+    for t in range(4):
+        bag.inertial("/cam/sensor_4/frameType_4", START_NS + t * PERIOD_NS, "", up, extra)
+    numbers = {"noiseDensity": 0.0, "randomWalk": 0.0, "referenceTemp": 0.0,
+               "bias": np.zeros(3), "gravity": np.zeros(3),
+               "scaleMisalignment": np.eye(3).ravel(), "tempSlope": np.zeros(9)}  # fmt: skip
+    bag.add("/cam/streamProfileType_4", "custom_msg/msg/OBImuStreamProfileInfo", START_NS,
+            header=bag.header(START_NS, ""), streamType=4, format=0, accelFullScaleRange=1,
+            accelSampleRate=1, gyroFullScaleRange=1, gyroSampleRate=1,
+            rotationMatrix=DEPTH_FROM_ACCELEROMETER[:3, :3].ravel().astype(np.float32),
+            translationMatrix=(1e3 * DEPTH_FROM_ACCELEROMETER[:3, 3]).astype(np.float32),
+            **numbers)  # fmt: skip
+
+
 def layout_of(folder: Path) -> Any:
     return open_layout(row(folder, calibration=rig_file(folder, "k1")))
 
@@ -106,6 +149,7 @@ def test_streams_lenses_and_pose_are_read(tmp_path: Path) -> None:
     assert recognise_recordings(tmp_path) == ("ros", ["k1"])
     with layout_of(tmp_path).open("k1") as recording:
         camera, images = recording.camera, list(recording.images())
+        assert recording.gravity == pytest.approx(COLOUR_FROM_DEPTH[:3, :3] @ DOWN, abs=1e-6)
     assert camera.colour_from_depth is not None and camera.depth is not None
     assert np.allclose(camera.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-6)
     assert np.allclose(camera.colour.matrix, COLOUR_K) and np.allclose(camera.depth.matrix, DEPTH_K)
@@ -117,7 +161,7 @@ def test_streams_lenses_and_pose_are_read(tmp_path: Path) -> None:
     colour = [image.content for image in images if image.kind == "colour"]
     assert colour == [jpeg(colour_image(t)) for t in range(3)]
     with Bag(tmp_path / "k1.bag") as bag:
-        assert SCHEME.read(bag, "", ()).stereo_baseline_m == pytest.approx(0.05)
+        assert SCHEME.read(bag, "", (), None).stereo_baseline_m == pytest.approx(0.05)
 
 
 def test_missing_profiles_and_other_lens_models_are_named(tmp_path: Path) -> None:

@@ -15,10 +15,13 @@ import pytest
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.layouts import open_layout, recognise_recordings
+from intercap_core.formats.recordings.ros.bag import Bag
+from intercap_core.formats.recordings.ros.streams import acceleration
 from tests.formats.recordings.ros.test_standard import row
 from tests.helpers.ros_files import (
     COLOUR_SIZE,
     DEPTH_SIZE,
+    DOWN,
     BagFile,
     colour_image,
     depth_image,
@@ -59,8 +62,18 @@ def frame(profile: Any, image: np.ndarray, number: int) -> Any:
     return result
 
 
+def motion(profile: Any, acceleration: np.ndarray, number: int) -> Any:
+    result = rs.software_motion_frame()
+    value = rs.vector()
+    value.x, value.y, value.z = acceleration.tolist()
+    result.data = value
+    result.timestamp, result.frame_number = 5000.0 + number * 10, number + 1
+    result.domain, result.profile = rs.timestamp_domain.hardware_clock, profile
+    return result
+
+
 class Recorded:
-    """A recording of a software device with depth and colour."""
+    """A recording of a software device with depth, colour and accelerometer."""
 
     def __init__(self, path: Path, colour_model: Any = None, with_depth: bool = True) -> None:
         device = rs.software_device()
@@ -83,16 +96,24 @@ class Recorded:
         extrinsics.rotation = COLOUR_FROM_DEPTH[:3, :3].T.ravel().tolist()  # by columns
         extrinsics.translation = COLOUR_FROM_DEPTH[:3, 3].tolist()
         depth.register_extrinsics_to(colour, extrinsics)
+        motion_sensor = device.add_sensor("Motion Module")
+        inertial = rs.motion_stream()
+        inertial.type, inertial.index, inertial.uid, inertial.fps = rs.stream.accel, 0, 3, 100
+        inertial.fmt = rs.format.motion_xyz32f
+        accelerometer = motion_sensor.add_motion_stream(inertial)
         recorder = rs.recorder(str(path), device)
         queue = rs.frame_queue(2 * IMAGES)
         used = [(depth_sensor, depth)] * with_depth + [(colour_sensor, colour)]
+        used += [(motion_sensor, accelerometer)]
         opened = recorder.query_sensors()
         opened = opened if with_depth else opened[1:]
         for sensor, (_, profile) in zip(opened, used, strict=True):
             sensor.open(profile)
             sensor.start(queue)
         for t in range(IMAGES):
-            for software, profile in used:
+            sample = motion(accelerometer.as_motion_stream_profile(), -9.8 * DOWN, t)
+            motion_sensor.on_motion_frame(sample)
+            for software, profile in used[:-1]:
                 image = depth_image(t) if profile is depth else colour_image(t)[..., ::-1].copy()
                 software.on_video_frame(frame(profile.as_video_stream_profile(), image, t))
             time.sleep(0.02)  # the recorder writes in a thread of its own
@@ -119,6 +140,11 @@ def test_a_software_device_is_read_as_recorded(tmp_path: Path) -> None:
         camera, images = recording.camera, list(recording.images())
         assert recording.serial == "012345"
         assert recording.fps == pytest.approx(30.0, rel=1e-3)
+        # A software device states no pose of its accelerometer; a D435i does, see below.
+        assert "no pose of its accelerometer" in " ".join(recording.notes)
+    with Bag(path) as bag:
+        sample = bag.first("/device_0/sensor_2/Accel_0/imu/data")
+    assert acceleration(sample) == pytest.approx(-9.8 * DOWN, abs=1e-6)
     assert camera.colour_from_depth is not None and camera.depth is not None
     assert np.allclose(camera.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-5)
     points = np.random.default_rng(0).uniform((-0.45, -0.35, 0.9), (0.45, 0.35, 1.5), (50, 3))
@@ -146,16 +172,20 @@ def test_fisheye_colour_is_refused(tmp_path: Path) -> None:
         open_layout(row(tmp_path, calibration=rig_file(tmp_path, "k1"))).open("k1")
 
 
-def test_text_in_bags_of_ros_2_is_read(tmp_path: Path) -> None:
-    """Topics and text as release 2.59 of the recorder wrote them to a ``.db3``."""
+@pytest.mark.parametrize("space", ["_", " "])
+def test_text_in_bags_of_ros_2_is_read(tmp_path: Path, space: str) -> None:
+    """Topics and text as release 2.59 of the recorder wrote them to a ``.db3``.
+
+    Names of options had spaces until 2019.
+    """
     prefix, times = "/device_0/sensor_0", [5_000_000, 5_033_333]
     rotation = ",".join(f"{value:.6f}" for value in COLOUR_FROM_DEPTH[:3, :3].T.ravel())
     translation = ",".join(f"{value:.6f}" for value in COLOUR_FROM_DEPTH[:3, 3])
     numbers = ",".join(map(str, COEFFICIENTS))
     texts = {
         "/device_0/info": "Name=Intel RealSense D455;Serial Number=012345",
-        f"{prefix}/option/Depth_Units/value": "0.000500",
-        f"{prefix}/option/Stereo_Baseline/value": "95.000000",
+        f"{prefix}/option/Depth{space}Units/value": "0.000500",
+        f"{prefix}/option/Stereo{space}Baseline/value": "95.000000",
         f"{prefix}/Depth_0/camera_info": "width=40;height=30;fx=38;ppx=20.5;fy=39;ppy=14.75;"
         "model=Brown Conrady;coeffs=0,0,0,0,0",
         "/device_0/sensor_1/Color_0/camera_info": "width=64;height=48;fx=60;ppx=32.5;fy=61;"
@@ -163,7 +193,12 @@ def test_text_in_bags_of_ros_2_is_read(tmp_path: Path) -> None:
         f"{prefix}/Depth_0/tf/ref_1": "rotation=1,0,0,0,1,0,0,0,1;translation=0,0,0",
         "/device_0/sensor_1/Color_0/tf/ref_1": f"rotation={rotation};translation={translation}",
     }
+    from_depth = pose(0.3, -0.02, 0.0, 0.01)  # of the accelerometer
+    rotation = ",".join(f"{value:.6f}" for value in from_depth[:3, :3].T.ravel())
+    motion = "/device_0/sensor_2/Accel_0"
+    texts[f"{motion}/tf/ref_1"] = f"rotation={rotation};translation=-0.02,0,0.01"
     with BagFile(tmp_path / "k1", "db3") as bag:
+        bag.inertial(f"{motion}/imu/data", 701, "Accel_0", from_depth[:3, :3] @ (-9.8 * DOWN))
         for topic, text in texts.items():
             bag.add(topic, "std_msgs/msg/String", 0, data=text)
         for t, time_us in enumerate(times):
@@ -185,6 +220,7 @@ def test_text_in_bags_of_ros_2_is_read(tmp_path: Path) -> None:
         camera, images = recording.camera, list(recording.images())
     assert camera.depth is not None and camera.colour_from_depth is not None
     assert np.allclose(camera.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-5)
+    assert recording.gravity == pytest.approx(COLOUR_FROM_DEPTH[:3, :3] @ DOWN, abs=1e-5)
     assert np.allclose(camera.colour.distortion[:5], COEFFICIENTS)
     assert camera.depth_noise == pytest.approx(0.08 / (38.0 * 0.095))
     for kind in ("colour", "depth"):

@@ -298,7 +298,10 @@ def depth_elsewhere(bag: BagFile) -> None:
 
 
 FAULTY = {
-    "no CameraInfo": (colour_of, "has no message on /k1/color/camera_info"),
+    "no CameraInfo": (
+        colour_of,
+        "no message on /k1/color/camera_info.*or state the colour lens in column calibration",
+    ),
     "two depth streams": (two_depth_streams, "holds 2 streams of depth.*column topics"),
     "unknown encoding": (
         lambda bag: (lens_of(bag), colour_of(bag, "bayer_rggb8")),
@@ -316,7 +319,7 @@ FAULTY = {
     "no calibration": (
         lambda bag: (bag.lens("/k1/color/camera_info", COLOUR_SIZE, np.zeros((3, 3)), "k1_color",
                               d=()), colour_of(bag)),
-        "camera_matrix is no",
+        "states no lens in /k1/color/camera_info.*or state the colour lens in column calibration",
     ),
     "depth without pose": (depth_elsewhere, "no static transform connects them"),
     "no colour": (
