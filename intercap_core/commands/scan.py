@@ -97,7 +97,7 @@ def scan(
     add_entry(project, name, labels, mesh, path)
     lines = [f"  {key}: {value}" for key, value in mesh.figures().items()]
     if mesh.closed_share > NOTED_CLOSED:
-        lines.append("  look at the orange parts of the page: no camera measured them")
+        lines.append("  no camera measured the orange parts of 'Measured surface' on the page")
     print_plain(standard_console(), "\n".join([f"scan of {name}", *lines]))
     return mesh, path, page
 

@@ -1,4 +1,4 @@
-"""Page on a scanned object: pictures from six sides, and figures."""
+"""Page on a scanned object: its colours and its unmeasured parts from six sides, and figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from intercap_core.output.site.drawing import (
 from intercap_core.scan.result import ScannedMesh
 
 _SIZE = 320  # px of a picture
-_UNMEASURED = (0.95, 0.55, 0.10)
+_MEASURED, _UNMEASURED = (0.75, 0.75, 0.75), (0.90, 0.35, 0.05)  # grey and orange
 _SIDES = {
     "from the front": (0, 1, 0),
     "from the right": (-1, 0, 0),
@@ -31,20 +31,22 @@ _SIDES = {
 
 
 def scan_page(name: str, sequences: Sequence[str], mesh: ScannedMesh) -> str:
-    """HTML page of a scan."""
+    """HTML page of a scan: pictures in the object's colours, then in those of the measurement."""
+    measurement = np.where(mesh.measured[:, None], _MEASURED, _UNMEASURED)
     return embed.render(
         "scan.html.j2",
         {
             "name": name,
             "sequences": sequences,
-            "pictures": [_picture(mesh, side) for side in _SIDES],
+            "pictures": [_picture(mesh, mesh.colours / 255.0, side) for side in _SIDES],
+            "measurement": [_picture(mesh, measurement, side) for side in _SIDES],
             "figures": mesh.figures(),
         },
     )
 
 
-def _picture(mesh: ScannedMesh, side: str) -> EncodedImage:
-    """Picture of the mesh from one side; surfaces without a measurement are orange."""
+def _picture(mesh: ScannedMesh, colours: np.ndarray, side: str) -> EncodedImage:
+    """Picture of the mesh from one side; ``colours``: (V, 3) RGB in 0..1."""
     away = np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * 2.5
     direction = np.array(_SIDES[side], float)
     up = np.array([0.0, 1, 0]) if direction[2] else np.array([0.0, 0, 1])
@@ -53,6 +55,5 @@ def _picture(mesh: ScannedMesh, side: str) -> EncodedImage:
     pose = rigid(rotation, -rotation @ (middle - away * direction))
     focal, centre = 2.2 * _SIZE, (_SIZE - 1) / 2
     lens = Intrinsics(_SIZE, _SIZE, focal, focal, centre, centre)
-    colours = np.where(mesh.measured[:, None], mesh.colours / 255.0, _UNMEASURED)
     drawn = draw([ColouredMesh(mesh.vertices, mesh.faces, pose, colours=colours)], lens)
     return encode_jpeg(drawn.over(np.ones((_SIZE, _SIZE, 3))), side)
