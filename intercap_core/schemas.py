@@ -244,31 +244,18 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
     return {
         "betas": Field(("S",) if one_shape else ("T", "S"), "float32", "shape coefficients"),
         "expression": Field(("T", "X"), "float32", "expression coefficients"),
-        "global_orient": Field(
-            ("T", "3"), "float32", "rotation vector of the pelvis", "rad", "master"
-        ),
+        "global_orient": Field(("T", "3"), "float32", "rotation vector of the pelvis", "rad", "master"),
         "transl": Field(("T", "3"), "float32", "translation", "m", "master"),
         "body_pose": Field(("T", "63"), "float32", "rotation vectors of joints 1-21", *rotation),
         "jaw_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
         "leye_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
         "reye_pose": Field(("T", "3"), "float32", "rotation vector", *rotation),
-        "left_hand_pose": Field(
-            ("T", "45"), "float32", "rotation vectors including the mean pose", *rotation
-        ),
-        "right_hand_pose": Field(
-            ("T", "45"), "float32", "rotation vectors including the mean pose", *rotation
-        ),
+        "left_hand_pose": Field(("T", "45"), "float32", "rotation vectors including the mean pose", *rotation),
+        "right_hand_pose": Field(("T", "45"), "float32", "rotation vectors including the mean pose", *rotation),
         "joints": Field(("T", "55", "3"), "float32", "posed joints", "m", "master"),
-        "keypoint_residual": Field(
-            ("T", "C"), "float32", "median reprojection error; NaN = not seen", "px"
-        ),
-        "cloud_residual": Field(
-            ("T",),
-            "float32",
-            "median distance of the person's points to the mesh; NaN = no points",
-            "m",
-        ),
-    }
+        "keypoint_residual": Field(("T", "C"), "float32", "median reprojection error; NaN = not seen", "px"),
+        "cloud_residual": Field(("T",), "float32", "median distance of the person's points to the mesh; NaN = no points", "m"),
+    }  # fmt: skip
 
 
 BODY_FIT = Schema(
@@ -287,100 +274,30 @@ BODY_FIT = Schema(
     fields={
         **_body(one_shape=False),
         "joint_sigma": Field(("T", "55"), "float32", "standard deviation of each joint", "m"),
-        "joint_covariance": Field(
-            ("T", "55", "3", "3"),
-            "float32",
-            "covariance of each joint; joint_sigma is the square root of a third of its trace",
-            "m^2",
-            "master",
-        ),
+        "joint_covariance": Field(("T", "55", "3", "3"), "float32", "covariance of each joint; joint_sigma is the square root of a third of its trace", "m^2", "master"),
         "failed": Field(("T",), "bool", "no plausible fit in this frame"),
         "bridged": Field(("T",), "bool", "interpolated from neighbouring frames"),
-        "uncertain": Field(
-            ("T",),
-            "bool",
-            "fitted, but the observations do not determine the body; see undetermined",
-        ),
+        "uncertain": Field(("T",), "bool", "fitted, but the observations do not determine the body; see undetermined"),
         "part_names": Field(("P",), "str", "names of the body parts of the axis P"),
-        "undetermined": Field(
-            ("T", "P"),
-            "bool",
-            "the observations do not determine this part, or most of them disagree with the fit",
-        ),
-        "keypoint_offsets": Field(
-            ("25", "3"),
-            "float32",
-            "offset of the detector's keypoint from the body's joint, in the frame of its bone",
-            "m",
-            "bone",
-        ),
-        "keypoint_sigma": Field(
-            ("135",),
-            "float32",
-            "standard deviation of a keypoint at typical confidence, after the offsets",
-            "m",
-        ),
-        "keypoint_doubt": Field(
-            ("135",), "float32", "exponent by which keypoint_sigma grows as confidence decreases"
-        ),
-        "covering": Field(
-            ("G",),
-            "float32",
-            "logarithm of the ratio of each covering's thickness (clothes, hair, shoes) to its prior mean",
-        ),
-        "shared_covariance": Field(
-            ("U", "U"),
-            "float64",
-            "covariance of the unknowns that all frames share: betas (unless each frame has its own), keypoint_offsets, covering",
-        ),
-        "covering_noise": Field(
-            ("G",), "float32", "standard deviation of the point clouds about each covering", "m"
-        ),
-        "cloud_offsets": Field(
-            ("T+1",), "int64", "frame t has the points cloud_offsets[t] to cloud_offsets[t + 1]"
-        ),
-        "cloud_points": Field(
-            ("N", "3"),
-            "float32",
-            "depth points of the person, with the cameras of the scene",
-            "m",
-            "master",
-            codec="none",
-        ),
-        "cloud_normals": Field(
-            ("N", "3"), "float32", "unit normals of the points", "1", "master", codec="none"
-        ),
+        "undetermined": Field(("T", "P"), "bool", "the observations do not determine this part, or most of them disagree with the fit"),
+        "keypoint_offsets": Field(("25", "3"), "float32", "offset of the detector's keypoint from the body's joint, in the frame of its bone", "m", "bone"),
+        "keypoint_sigma": Field(("135",), "float32", "standard deviation of a keypoint at typical confidence, after the offsets", "m"),
+        "keypoint_doubt": Field(("135",), "float32", "exponent by which keypoint_sigma grows as confidence decreases"),
+        "covering": Field(("G",), "float32", "logarithm of the ratio of each covering's thickness (clothes, hair, shoes) to its prior mean"),
+        "shared_covariance": Field(("U", "U"), "float64", "covariance of the unknowns that all frames share: betas (unless each frame has its own), keypoint_offsets, covering"),
+        "covering_noise": Field(("G",), "float32", "standard deviation of the point clouds about each covering", "m"),
+        "cloud_offsets": Field(("T+1",), "int64", "frame t has the points cloud_offsets[t] to cloud_offsets[t + 1]"),
+        "cloud_points": Field(("N", "3"), "float32", "depth points of the person, with the cameras of the scene", "m", "master", codec="none"),
+        "cloud_normals": Field(("N", "3"), "float32", "unit normals of the points", "1", "master", codec="none"),
         "cloud_edge": Field(("N",), "bool", "the point is at an edge of the depth image"),
         "cloud_view": Field(("N",), "uint8", "camera of the point"),
-        "cloud_window": Field(
-            ("T", "C", "4"),
-            "int32",
-            "first row, first column, height and width of the depth image around the person; 0 = "
-            "no points",
-            "px",
-        ),
-        "rim_offsets": Field(
-            ("T+1",), "int64", "frame t has the rays rim_offsets[t] to rim_offsets[t + 1]"
-        ),
-        "rim_rays": Field(
-            ("R", "3"),
-            "float32",
-            "unit rays through the rims of the person's masks",
-            "1",
-            "colour camera",
-            codec="none",
-        ),
-        "rim_normals": Field(
-            ("R", "3"),
-            "float32",
-            "outward unit normals of the planes that touch the person along the rays",
-            "1",
-            "colour camera",
-            codec="none",
-        ),
+        "cloud_window": Field(("T", "C", "4"), "int32", "first row, first column, height and width of the depth image around the person; 0 = no points", "px"),
+        "rim_offsets": Field(("T+1",), "int64", "frame t has the rays rim_offsets[t] to rim_offsets[t + 1]"),
+        "rim_rays": Field(("R", "3"), "float32", "unit rays through the rims of the person's masks", "1", "colour camera", codec="none"),
+        "rim_normals": Field(("R", "3"), "float32", "outward unit normals of the planes that touch the person along the rays", "1", "colour camera", codec="none"),
         "rim_view": Field(("R",), "uint8", "camera of the ray"),
     },
-)
+)  # fmt: skip
 
 JOINT = Schema(
     name="joint",
@@ -406,51 +323,22 @@ JOINT = Schema(
         **_body(one_shape=True),
         **_OBJECT_POSE,
         "region_names": Field(("R",), "str", "contact regions of the body"),
-        "contact_probability": Field(
-            ("T", "R"), "float32", "probability that the region touches the object; NaN = no object"
-        ),
-        "contact_annotated": Field(
-            ("T", "R"), "int8", "annotation: 1 contact, 0 no contact, -1 not annotated"
-        ),
-        "time_offset": Field(
-            ("C",), "float64", "exposure time minus the set's time, as in scene.h5", "s"
-        ),
-        "time_offset_sigma": Field(
-            ("C",), "float64", "standard deviation of time_offset; NaN = not estimated", "s"
-        ),
+        "contact_probability": Field(("T", "R"), "float32", "probability that the region touches the object; NaN = no object"),
+        "contact_annotated": Field(("T", "R"), "int8", "annotation: 1 contact, 0 no contact, -1 not annotated"),
+        "time_offset": Field(("C",), "float64", "exposure time minus the set's time, as in scene.h5", "s"),
+        "time_offset_sigma": Field(("C",), "float64", "standard deviation of time_offset; NaN = not estimated", "s"),
         "camera_names": Field(("C",), "str", "camera names"),
-        "master_from_colour": Field(
-            ("C", "4", "4"),
-            "float64",
-            "extrinsics refined by body and object",
-            "m",
-            "master",
-        ),
-        "depth_bias": Field(
-            ("C",),
-            "float64",
-            "bias to subtract from each camera's depth, refined by body and object",
-            "m",
-        ),
+        "master_from_colour": Field(("C", "4", "4"), "float64", "extrinsics refined by body and object", "m", "master"),
+        "depth_bias": Field(("C",), "float64", "bias to subtract from each camera's depth, refined by body and object", "m"),
         **_CAMERA_COVARIANCE,
         "energy_names": Field(("E",), "str", "terms of the energy"),
         "energy_before": Field(("E",), "float64", "weighted energy of each term at the start"),
         "energy_after": Field(("E",), "float64", "weighted energy of each term at the end"),
-        "hand_undetermined": Field(
-            ("T", "2"),
-            "bool",
-            "left and right hand: the deviation of its finger joints is above 13 mm, also with the frames around",
-        ),
+        "hand_undetermined": Field(("T", "2"), "bool", "left and right hand: the deviation of its finger joints is above 13 mm, also with the frames around"),
         **_FLAGS,
-        "surface_distance": Field(
-            ("T", "2"),
-            "float64",
-            "imported results with another body mesh: mean and 95th percentile of the distance between the fitted skin and the imported one; NaN = no body in the frame",
-            "m",
-            optional=True,
-        ),
+        "surface_distance": Field(("T", "2"), "float64", "imported results with another body mesh: mean and 95th percentile of the distance between the fitted skin and the imported one; NaN = no body in the frame", "m", optional=True),
     },
-)
+)  # fmt: skip
 
 TRUTH = Schema(
     name="truth",
