@@ -133,7 +133,7 @@ def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:
 
 
 def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Figures:
-    from intercap_core.commands.evaluate.sequences import areas
+    from bench.evaluate.sequences import areas
 
     found = areas([SequenceMetrics.read(by_stage["metrics"]) for by_stage in paths.values()])
     return {

@@ -25,12 +25,11 @@ from scipy.spatial.transform import Rotation
 
 from bench import annotate_page
 from bench.annotate_page import Hand, Point
-from bench.command import exit_on_user_error
+from bench.command import exit_on_user_error, replace_figures
+from bench.evaluate.objects import measure
 from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.annotate.rerun import targets
-from intercap_core.commands.bench import replace_figures
-from intercap_core.commands.evaluate.objects import measure
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact_figures import stated_contact_figures

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from intercap_core.commands.bench import replace_figures
+from bench.command import replace_figures
 from intercap_core.errors import UserError
 
 if TYPE_CHECKING:

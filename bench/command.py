@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from intercap_core.commands import bench as commands
 from intercap_core.errors import UserError
 
 
 def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
     """Write ``<area>.<measure>`` to the JSON file, in place of the area's older figures."""
     new = {f"{area}.{key}": round(float(value), 4) for key, value in figures.items()}
-    commands.add_figures(output, new)
+    replace_figures(output, new, (f"{area}.",))
+
+
+def replace_figures(output: Path, figures: Mapping[str, float], prefixes: tuple[str, ...]) -> None:
+    """Add figures to a JSON file and remove those whose name begins with one of ``prefixes``.
+
+    Raises UserError if the file is no JSON object.
+    """
+    known = {}
+    if output.exists():
+        try:
+            known = dict(json.loads(output.read_text(encoding="utf-8")))
+        except (ValueError, TypeError):
+            raise UserError(f"{output} holds no figures; remove it or name another file") from None
+    kept = {key: value for key, value in known.items() if not key.startswith(prefixes)}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -27,8 +27,8 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from bench.command import exit_on_user_error
+from bench.evaluate.part import number
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import number
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.rig import Rig

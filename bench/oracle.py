@@ -45,12 +45,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from bench.again import artefacts_of, check_run, compute_once, slug
-from bench.command import exit_on_user_error
+from bench.command import exit_on_user_error, replace_figures
+from bench.evaluate.part import number
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.commands.bench import replace_figures
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import number
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures

@@ -2,7 +2,7 @@
 
     python tools/size_report.py [ROOT]
 
-Constants are counted as in :mod:`intercap_core.commands.evaluate.constants`.
+Constants are counted as in :mod:`bench.evaluate.constants`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 from collections import Counter, defaultdict
 from pathlib import Path
 
-from intercap_core.commands.evaluate.constants import count_constants
+from bench.evaluate.constants import count_constants
 
 PACKAGE = "intercap_core"
 GENERATED = ("artefacts.md", "workflow.md")

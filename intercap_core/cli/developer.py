@@ -1,7 +1,11 @@
-"""`intercap dev`: commands for the development of this program."""
+"""`intercap dev`: commands for the development of this program.
+
+Evaluation and benchmarks are in the folder ``bench`` of a checkout.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +26,19 @@ app = typer.Typer()
 Part = Literal[
     "sequences", "captures", "objects", "bodies", "field_scenes", "field", "detector", "rig", "scan"
 ]  # fmt: skip
+
+
+def _bench(name: str) -> Any:
+    """Import the module ``bench.<name>``; raises UserError outside of a checkout."""
+    try:
+        return import_module(f"bench.{name}")
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("bench"):
+            raise
+        raise UserError(
+            "this command needs a checkout of the repository, which has the folder bench; run "
+            "`make environment` in it and use its .venv/bin/intercap"
+        ) from None
 
 
 def _evaluated(stage: str, which: str = "Projects") -> Any:
@@ -102,16 +119,14 @@ def evaluate(
     Examples: intercap dev evaluate; intercap dev evaluate --only bodies --output body.json;
     intercap dev evaluate --only objects --seed 7 --output results/seed_7/evaluation.json
     """
-    from intercap_core.commands.evaluate.run import evaluate as run_evaluation
-    from intercap_core.commands.evaluate.run import evaluate_quick
-
     check_output(output, replace_any=True)
     if quick and seed is not None:
         raise UserError("--quick is a fixed set; leave out --quick or --seed")
     if update_reference and not quick:
         raise UserError("--update-reference records the quick set; add --quick")
+    evaluation = _bench("evaluate.run")
     if quick:
-        status = evaluate_quick(output, cores=cores, renew_reference=update_reference)
+        status = evaluation.evaluate_quick(output, cores=cores, renew_reference=update_reference)
         raise typer.Exit(status)
     parts = {
         "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
@@ -119,7 +134,7 @@ def evaluate(
         "scan": scan,
     }  # fmt: skip
     chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
-    raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))
+    raise typer.Exit(evaluation.evaluate(chosen, output, cores=cores, seed=seed))
 
 
 @app.command()
@@ -134,10 +149,8 @@ def bench(
 
     Example: intercap dev bench
     """
-    from intercap_core.commands.bench import measure
-
     check_output(output, replace_any=True)
-    measure(settings, output, cores=cores)
+    _bench("workflow_speed").measure(settings, output, cores=cores)
 
 
 @app.command()

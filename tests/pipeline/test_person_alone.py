@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 import pytest
 
+from bench.evaluate import field
+from bench.evaluate.part import Measured
 from intercap_core.commands.check import check_sequences
 from intercap_core.commands.closeups import draw_closeups
-from intercap_core.commands.evaluate import field
-from intercap_core.commands.evaluate.part import Measured
 from intercap_core.commands.inspect import print_summary
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError

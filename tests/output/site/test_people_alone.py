@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from intercap_core.commands.evaluate.sequences import areas
+from bench.evaluate.sequences import areas
 from intercap_core.config import PageSettings
 from intercap_core.evaluation.figures import SequenceMetrics, flag_figures, truth_figures
 from intercap_core.evaluation.summary import SequenceSummary, collect_heatmaps

@@ -15,11 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from intercap_core import artefacts
-from intercap_core.artefacts import Artefact
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -30,7 +26,11 @@ from intercap_core.commands.evaluate.part import (
     variant,
     with_spread,
 )
-from intercap_core.commands.evaluate.sequences import areas
+from bench.evaluate.sequences import areas
+from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation.field_errors import stated_displacement
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement

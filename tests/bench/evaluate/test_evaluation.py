@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from intercap_core.commands.evaluate.run import PARTS, QUICK_SETTINGS
+from bench.evaluate.run import PARTS, QUICK_SETTINGS
 from intercap_core.project import load_project
 
 CONFIGS = sorted(Path("config/capture").glob("*.yaml"))

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     SPREAD,
     EvaluationPart,
     Figures,
@@ -19,6 +18,7 @@ from intercap_core.commands.evaluate.part import (
     truth_of,
     with_spread,
 )
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import scene_errors
 from intercap_core.evaluation.scene_errors import CaptureErrors
 from intercap_core.project import Project

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -21,6 +20,7 @@ from intercap_core.commands.evaluate.part import (
     number,
     truth_of,
 )
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import field_errors
 from intercap_core.evaluation.faulty_rigs import name_faults
 from intercap_core.evaluation.field_errors import FieldScene

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -20,6 +19,7 @@ from intercap_core.commands.evaluate.part import (
     variant,
     with_spread,
 )
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.geometry.rigid.mesh import ObjectMesh

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     SPREAD,
     EvaluationPart,
     Figures,
@@ -17,6 +16,7 @@ from intercap_core.commands.evaluate.part import (
     number,
     with_spread,
 )
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.through_wall import count_behind_wall

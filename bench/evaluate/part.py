@@ -119,7 +119,7 @@ class EvaluationPart(Generic[Errors]):
 
 
 def _measure_recording(part: str, settings: Path, sequence: str) -> Any:
-    module = import_module(f"intercap_core.commands.evaluate.{part}")
+    module = import_module(f"bench.evaluate.{part}")
     return measure_recording(module.PART, load_project(settings), sequence)
 
 

@@ -11,11 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.calibrate.draft import draft_rig
-from intercap_core.calibrate.rig_poses import find_poses
-from intercap_core.commands.calibrate import record
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -25,6 +21,10 @@ from intercap_core.commands.evaluate.part import (
     truth_of,
     with_spread,
 )
+from intercap_core.calibrate.draft import draft_rig
+from intercap_core.calibrate.rig_poses import find_poses
+from intercap_core.commands.calibrate import record
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.evaluation.rig_errors import ChainErrors, RigErrors, figures, pose_errors
 from intercap_core.formats.calibration.boards import parse_board

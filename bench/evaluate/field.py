@@ -16,12 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from intercap_core import artefacts
-from intercap_core.body.artefact import load_model
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.bench import time_hold_out
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -30,6 +25,11 @@ from intercap_core.commands.evaluate.part import (
     number,
     truth_of,
 )
+from bench.workflow_speed import time_hold_out
+from intercap_core import artefacts
+from intercap_core.body.artefact import load_model
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import field_errors, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import TRUE, stated_errors, verdict_figures

@@ -12,8 +12,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -25,6 +24,7 @@ from intercap_core.commands.evaluate.part import (
     variant,
     with_spread,
 )
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.config import Config
 from intercap_core.evaluation import body_errors
 from intercap_core.evaluation.body_errors import BodyErrors

@@ -14,9 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from intercap_core import artefacts
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import (
+from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
@@ -26,6 +24,8 @@ from intercap_core.commands.evaluate.part import (
     truth_of,
     with_spread,
 )
+from intercap_core import artefacts
+from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.scan import scan
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.evaluate.captures import PART
-from intercap_core.commands.evaluate.part import measure_recording, with_spread
+from bench.evaluate.captures import PART
+from bench.evaluate.part import measure_recording, with_spread
 from intercap_core.config import Config
 from intercap_core.errors import UserError
 from intercap_core.project import Project

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.evaluate.reference import (
+from bench.evaluate.reference import (
     GatedFigure,
     GateResult,
     passes_gate,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shutil
 import statistics
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.command import replace_figures
 from intercap_core import artefacts
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import snakemake_command
@@ -67,7 +67,8 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     if len(seconds_of_jobs) > 1:
         hours = figures["scale.intercap_core_hours"] = core_hours(seconds_of_jobs)
         print(f"InterCap, {INTERCAP[1]:,} frames: {hours:.1f} core hours")
-    add_figures(output, figures)
+    areas = tuple({f"{key.partition('.')[0]}." for key in figures})
+    replace_figures(output, figures, areas)
     print(output)
 
 
@@ -100,33 +101,6 @@ def core_hours(seconds: Mapping[int, float]) -> float:
     per_frame, per_sequence = np.polyfit(frames, list(seconds.values()), 1)
     total = per_sequence * INTERCAP[0] + per_frame * INTERCAP[1]
     return round(float(total) / 3600, 2)
-
-
-def add_figures(output: Path, figures: Mapping[str, float]) -> None:
-    """Write ``figures`` to a JSON file; its other figures of the same areas are removed.
-
-    The area is the part of a key before the dot. Figures of other areas are kept.
-
-    Raises UserError if the file is no JSON object.
-    """
-    areas = {f"{key.partition('.')[0]}." for key in figures}
-    replace_figures(output, figures, tuple(areas))
-
-
-def replace_figures(output: Path, figures: Mapping[str, float], prefixes: tuple[str, ...]) -> None:
-    """Add figures to a JSON file and remove those whose name begins with one of ``prefixes``.
-
-    Raises UserError if the file is no JSON object.
-    """
-    known = {}
-    if output.exists():
-        try:
-            known = dict(json.loads(output.read_text(encoding="utf-8")))
-        except (ValueError, TypeError):
-            raise UserError(f"{output} holds no figures; remove it or name another file") from None
-    kept = {key: value for key, value in known.items() if not key.startswith(prefixes)}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
 
 def _run(project: Project, path: Path, cores: int) -> tuple[float, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.commands.evaluate.detector import grip_slips, rig_errors
+from bench.evaluate.detector import grip_slips, rig_errors
 
 
 def test_a_grip_slips_by_what_its_error_changes() -> None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import ast
 import re
 from collections import Counter
-from pathlib import Path
+
+from intercap_core.shipped import PACKAGE
 
 SOURCE = re.compile(
     r"et al|\b(19|20)\d\d\b|data ?sheet|doi|arXiv|ISO|IEEE|BOP|COCO|SMPL|Kinect|OpenPose|anatom|"
@@ -21,9 +22,8 @@ TUNED = re.compile(r"\btuned\b|\bstudio\b", re.IGNORECASE)
 
 
 def total_constants() -> int:
-    """Number of constants in all modules of this package."""
-    package = Path(__file__).resolve().parents[2]
-    texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
+    """Number of constants in all modules of the package."""
+    texts = (path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
     return sum(count_constants(text)["constants"] for text in texts)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from intercap_core.commands.evaluate import (
+from bench.evaluate import (
     bodies,
     captures,
     detector,
@@ -21,16 +21,16 @@ from intercap_core.commands.evaluate import (
     scan,
     sequences,
 )
-from intercap_core.commands.evaluate.constants import total_constants
-from intercap_core.commands.evaluate.part import EvaluationPart, Figures, require_truth
-from intercap_core.commands.evaluate.reference import (
+from bench.evaluate.constants import total_constants
+from bench.evaluate.part import EvaluationPart, Figures, require_truth
+from bench.evaluate.reference import (
     REFERENCE,
     passes_gate,
     read_reference,
     update_reference,
 )
-from intercap_core.commands.evaluate.seeds import redraw_settings
-from intercap_core.commands.evaluate.workflows import (
+from bench.evaluate.seeds import redraw_settings
+from bench.evaluate.workflows import (
     bring_up_to_date,
     minutes_of_parts,
     print_minutes,
