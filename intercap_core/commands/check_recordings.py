@@ -201,7 +201,8 @@ class RecordingCheck:
         if not recorded:
             return
         if kind == "keypoints":
-            whole, files = keypoint_files.keypoint_paths(folder, camera)
+            found = keypoint_files.KeypointFiles.find(folder, camera)
+            whole, files = found.whole, list(found.single.values())
         else:
             whole = candidate_files.camera_file(folder, camera)
             files = candidate_files.image_files(folder, camera)
@@ -235,8 +236,7 @@ class RecordingCheck:
             return []
         if kind == "candidates":
             return candidate_files.candidate_paths(folder, camera, self.row.layout)
-        whole, single = keypoint_files.keypoint_paths(folder, camera)
-        return single if whole is None else [whole]
+        return keypoint_files.KeypointFiles.find(folder, camera).used
 
     def numbered(self, kind: str, camera: str) -> CameraImages:
         """The images, with the first number that the settings state for keypoints or candidates."""

@@ -20,12 +20,8 @@ from intercap_core.formats.detections.candidate_files import CandidatesByImage
 from intercap_core.formats.detections.class_names import class_names
 from intercap_core.formats.detections.image_numbers import CameraImages, camera_images
 from intercap_core.formats.detections.instance import Instance, boxes_of
-from intercap_core.formats.detections.keypoint_files import (
-    NOBODY,
-    KeypointCleaner,
-    PeopleByImage,
-)
 from intercap_core.formats.detections.mask_files import BehaveFiles
+from intercap_core.formats.detections.people_of_camera import NOBODY, KeypointCleaner, PeopleByImage
 from intercap_core.progress import Progress
 from intercap_core.schemas import DETECTIONS, FRAMES
 

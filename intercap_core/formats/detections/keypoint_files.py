@@ -1,20 +1,21 @@
 """Files of keypoints of one camera, sorted by image.
 
 A file of the camera (``<camera>.json``) holds all images; otherwise its folder ``<camera>/`` holds
-a file for each image. :mod:`.keypoints` knows the names of the files and reads them. Entries and
-files that cannot be used are noted.
+a file for each image. :mod:`.keypoints` knows the names of the files and reads them,
+:mod:`.people_of_camera` recognises their layout and unit. Entries and files that cannot be used are
+noted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import (
     DetectionPreview,
@@ -27,294 +28,94 @@ from intercap_core.formats.detections.image_numbers import (
     CameraImages,
     find_repeated_number,
     note_absent,
-    note_broken,
-    note_faults,
     note_unmatched,
     preview_names,
     refuse_both,
     short_name,
     sort_by_image,
 )
-from intercap_core.formats.detections.instance import (
-    MAX_SHARE,
-    are_shares,
-    hint_on_size,
-    notes_on_extent,
-    scale_to,
-)
-from intercap_core.formats.detections.keypoints import (
-    KeypointReader,
-    PeopleFile,
-    compare_bones,
-    layouts,
-    mean_length,
-    read_people,
-    readers,
-    visible,
+from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers, visible
+from intercap_core.formats.detections.people_of_camera import (
+    NOBODY,
+    PeopleByImage,
+    PeopleReading,
+    recognise_layout,
 )
 
-# Shares of compare_bones in 427 cameras of virtual recordings (noise, MediaPipe, its errors): up to
-# 0.72 in body_25, up to 0.94 without neck and middle of the hips. Right points read in another
-# layout: body_25b as body_25 0.75 to 1.35 (median 0.96), kinect_v2 as body_25 0.69 to 1.22, h36m as
-# coco 0.90 to 1.70. Points in random order: about 1.3.
-CERTAIN_BONE_SHARE = 0.75  # below it the layout is certain
-CERTAIN_WITHOUT_NECK = 0.95  # the same for layouts without neck and middle of the hips
-MAX_BONE_SHARE = 1.1  # above it points are not joined by bones
-MAX_SHARE_OF_OTHER = 0.75  # another layout is used if its share is smaller by this factor
 FILES_PREVIEWED = 20
-NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
 
 
-@dataclass
-class KeypointCleaner:
-    """Removes impossible keypoints of one camera's images and counts them."""
+@dataclass(frozen=True)
+class KeypointFiles:
+    """Files of keypoints of one camera."""
 
-    size: tuple[int, int]
-    """Width and height of the images."""
-    full_confidence: float = 1.0
-    """Confidence that counts as 1."""
-    seen: int = 0
-    """Number of points with finite coordinates and a confidence above 0."""
-    outside: int = 0
-    """Number of points outside the image."""
-    beyond: int = 0
-    """Number of points with more than the full confidence."""
-    normalised: int = 0
-    """Number of people with normalised coordinates."""
-    extent: float = 0.0
-    """Largest x or y of a point, as a share of the image's width or height."""
+    whole: Path | None
+    """File of all images."""
+    single: Mapping[str, Path]
+    """Files of single images, by the image's name."""
+    reader: KeypointReader
+    """Reader of ``whole`` if there is one, otherwise of ``single``."""
 
-    def clean(self, people: np.ndarray) -> np.ndarray:
-        """Return the usable people (P, 135, 3) as float32: x, y (px), confidence from 0 to 1.
-
-        People without a visible point or with normalised coordinates are left out. A point becomes
-        zeros if it is not finite, lies outside the image or exactly at (0, 0), or if it has no
-        confidence. Confidence beyond the full one is clipped to 1.
-        """
-        x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
-        with np.errstate(invalid="ignore"):
-            seen = visible(np.asarray(people, np.float64))
-            # The centres of pixels have integer coordinates.
-            inside = (np.minimum(x, y) >= -0.5) & (x < self.size[0] - 0.5)
-            inside &= y < self.size[1] - 0.5
-        beyond = seen & (confidence > self.full_confidence)
-        self.seen += int(seen.sum())
-        self.outside += int((seen & ~inside).sum())
-        self.beyond += int(beyond.sum())
-        known = seen & inside
-        share = np.minimum(np.where(known, confidence, 0) / self.full_confidence, 1)
-        result = np.where(known[..., None], np.stack([x, y, share], -1), 0).astype(np.float32)
-        self.extent = max(self.extent, float((result[..., :2] / self.size).max(initial=0)))
-        present = known.any(-1)
-        largest = result[..., :2].max((1, 2), initial=0)
-        normalised = present & (largest <= MAX_SHARE)
-        self.normalised += int(normalised.sum())
-        return result[present & ~normalised]
-
-    def notes(self) -> list[str]:
-        """Messages for the user about points and people that were changed or left out."""
-        notes = []
-        width, height = self.size
-        if self.outside:
-            hint = hint_on_size(self.outside, self.seen)
-            notes.append(
-                f"{self.outside} of {self.seen} keypoints lie outside the image of "
-                f"{width}x{height} pixels and count as not seen{hint}"
-            )
-        if not self.normalised:
-            notes += notes_on_extent("keypoints", self.extent, self.size)
-        if self.normalised:
-            notes.append(
-                f"{self.normalised} people left out whose points all lie within "
-                f"{MAX_SHARE:g} pixels of the upper left corner: coordinates must be "
-                "pixels, not shares of the image"
-            )
-        if self.beyond:
-            notes.append(
-                f"{self.beyond} of {self.seen} confidences are beyond {self.full_confidence:g} and "
-                "count as 1; detections.keypoint_full_confidence sets the full confidence"
-            )
-        return notes
-
-
-@dataclass
-class PeopleByImage:
-    """People of one camera."""
-
-    by_image: dict[int, np.ndarray] = field(default_factory=dict)
-    """People (P, 135, 3) by image number; P = 0 if the detector found none in the image."""
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user about people and files that were left out."""
-    recognised: list[str] = field(default_factory=list)
-    """Properties recognised by content: layout, numbering, unit."""
-
-
-@dataclass
-class _Reading:
-    """State while one camera's files are read."""
-
-    images: CameraImages
-    layout: str | None
-    """Layout according to the settings."""
-    raw: dict[int, np.ndarray] = field(default_factory=dict)
-    """People (P, 135, 3) by image number, as written."""
-    assumed: set[str] = field(default_factory=set)
-    """Layouts that were selected by the number of points alone."""
-    notes: list[str] = field(default_factory=list)
-    recognised: list[str] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-    """Files that cannot be loaded."""
-    faults: list[str] = field(default_factory=list)
-    """People or files that cannot be used."""
-    used: bool = False
-    """Whether anything could be used."""
-
-    def parse(
-        self, loaded: Any, reader: KeypointReader, path: Path, *, one_image: bool
-    ) -> PeopleFile | None:
-        """The people of a loaded file in pixels of the images; None with a fault if none."""
-        try:
-            content = read_people(loaded, reader.load, one_image=one_image, layout=self.layout)
-        except UnreadableDetections as error:
-            self.faults.append(f"{short_name(path)} {error}")
-            return None
-        self.assumed |= content.assumed
-        results, content.results = content.results, []
-        for key, person in results:
-            try:
-                x, y = scale_to(key.size, self.images.size) if key.size else (1.0, 1.0)
-            except ValueError as error:
-                content.add_fault("a person", key, error)
-                continue
-            if (x, y) != (1.0, 1.0):  # pixel centres have integer coordinates
-                scaled = (person[:, :2] + 0.5) * (x, y) - 0.5
-                seen = (person[:, :2] != 0).any(1, keepdims=True)
-                person = np.column_stack([np.where(seen, scaled, 0), person[:, 2]])
-                content.scaled += 1
-                own = "x".join(map(str, key.size or ()))
-                self.recognised.append(f"scaled from {own} pixels")
-            content.results.append((key, person))
-        return content
+    @classmethod
+    def find(cls, folder: Path, camera: str) -> KeypointFiles:
+        """Find the files of a camera in the ``folder`` of a sequence's keypoints."""
+        own = folder / camera
+        paths = sorted(own.iterdir()) if own.is_dir() else []
+        paths = [path for path in paths if not path.name.startswith(".")]
+        matches = ((reader.match_images(paths), reader) for reader in readers())
+        single, reader = next((match for match in matches if match[0]), ({}, readers()[0]))
+        for possible in readers():
+            for name in possible.camera_files:
+                whole = folder / name.replace("{camera}", camera)
+                if whole.is_file():
+                    return cls(whole, single, possible)
+        return cls(None, single, reader)
 
     @property
-    def people(self) -> np.ndarray:
-        """All people (N, 135, 3), as written."""
-        return np.concatenate([NOBODY, *self.raw.values()])
+    def used(self) -> list[Path]:
+        """The files that are read."""
+        return sorted(self.single.values()) if self.whole is None else [self.whole]
 
-    def finish(self, folder: Path, camera: str, full_confidence: float) -> PeopleByImage:
-        """The people, with notes; raises UserError if files can be loaded and none can be used."""
-        notes = self.notes
-        note_broken(notes, "keypoint files", self.broken)
-        if self.faults and not self.used:
-            raise UserError(
-                f"{folder}: none of camera {camera}'s keypoints can be used: {self.faults[0]}"
-            )
-        note_faults(notes, "people or files of keypoints", self.faults)
-        self._scale_shares()
-        cleaner = KeypointCleaner(self.images.size, full_confidence)
-        by_image = {number: cleaner.clean(people) for number, people in self.raw.items()}
-        # Only `intercap check` reports a default layout that fits; the artefact has no note.
-        recognised = list(dict.fromkeys(self.recognised))
-        notes += [text for text in recognised if not text.startswith("layout ")]
-        notes += cleaner.notes()
-        return PeopleByImage(by_image, notes, recognised)
+    def refuse_both(self) -> None:
+        """Raise UserError if there is a file of all images and also files of single images."""
+        refuse_both(self.whole, self.single.values())
 
-    def _scale_shares(self) -> None:
-        """Scale coordinates that are shares of the images' size if those of all people are."""
-        points = self.people.reshape(-1, 3)
-        values = points[visible(points), :2]
-        # Coordinates from -1 to 1 are relative to the middle of the image, in an unknown unit.
-        if are_shares(values.ravel()) and (values < 0).mean() < 0.1:
-            factors = (*self.images.size, 1.0)
-            self.raw = {number: people * factors for number, people in self.raw.items()}
-            width, height = self.images.size
-            self.recognised.append(
-                f"coordinates are shares of the image's size, scaled to {width}x{height} pixels"
-            )
+    def load_first(
+        self, notes: list[str], load: Callable[[Path], Any] = read_head
+    ) -> dict[Path, Any]:
+        """Load the beginning of the file of all images, or some of the files of single images.
+
+        ``load`` parses JSON. Files that cannot be loaded are added to ``notes``.
+        """
+        loaded: dict[Path, Any] = {}
+        for path in self.used[:: -(-len(self.used) // FILES_PREVIEWED) or 1]:
+            try:
+                reads_json = self.reader.load is read_json
+                content = load(path) if reads_json else self.reader.load(path)
+            except UnreadableDetections as error:
+                notes.append(f"{path} {error}")
+                continue
+            if content is not None:
+                loaded[path] = content
+        return loaded
 
 
-def _recognise_layout(
-    reading: _Reading, read_as: Callable[[str], _Reading], folder: Path
-) -> _Reading:
-    """Compare the assumed layout with the people's bones; read again if another one fits.
+def _read(
+    folder: Path,
+    images: CameraImages,
+    layout: str | None,
+    full_confidence: float,
+    add: Callable[[PeopleReading], None],
+) -> tuple[PeopleReading, PeopleByImage]:
+    """Read people by ``add`` in the stated or the recognised layout."""
 
-    Raises UserError if no layout of the same number of points fits.
-
-    Args:
-        reading: all people of a camera.
-        read_as: reads them in the named layout.
-        folder: folder of keypoints, for messages.
-    """
-    share = compare_bones(reading.people)
-    if reading.layout is not None or len(reading.assumed) != 1 or share is None:
+    def read_as(name: str | None) -> PeopleReading:
+        reading = PeopleReading(images, name)
+        add(reading)
         return reading
-    (assumed,) = reading.assumed
-    points = layouts()[assumed].points
-    has_neck = {"neck", "mid_hip"}.issubset(points)
-    if share <= (CERTAIN_BONE_SHARE if has_neck else CERTAIN_WITHOUT_NECK):
-        reading.recognised.append(f"layout {assumed}")
-        return reading
-    count = len(points)
-    readings = {
-        name: read_as(name)
-        for name, layout in layouts().items()
-        if name != assumed and len(layout.points) == count
-    }
-    limit = min(MAX_SHARE_OF_OTHER * share, MAX_BONE_SHARE)
-    # Long bones fit several layouts if arms are in the place of legs, of which the mean is larger.
-    fitting = {
-        name: compare_bones(other.people, mean_length)
-        for name, other in readings.items()
-        if (compare_bones(other.people) or np.inf) < limit
-    }
-    best = min(fitting, key=lambda name: fitting[name] or np.inf, default=None)
-    if best is not None:
-        found = readings[best]
-        found.recognised.append(f"{count} points are {best}, not {assumed}, by their bones")
-        return found
-    if share > MAX_BONE_SHARE:
-        raise UserError(
-            f"{folder}: the {count} keypoints of camera {reading.images.name} fit none of the "
-            f"layouts {', '.join([assumed, *readings])}: in {assumed}, bones are {share:.2f} times "
-            f"as long as the distance of two points, expected less than {MAX_BONE_SHARE:g}; name "
-            "the layout in detections.keypoint_layout, or write the keypoints in one of "
-            f"{', '.join(sorted(layouts()))}"
-        )
-    reading.recognised.append(
-        f"{count} points are taken for {assumed}, but bones are {share:.2f} times as long as the "
-        "distance of two points; detections.keypoint_layout states another layout"
-    )
-    return reading
 
-
-def find_camera_file(folder: Path, camera: str) -> tuple[Path, KeypointReader] | None:
-    """The file that holds the keypoints of all images of a camera, and the reader of its form."""
-    for reader in readers():
-        for name in reader.camera_files:
-            path = folder / name.replace("{camera}", camera)
-            if path.is_file():
-                return path, reader
-    return None
-
-
-def find_image_files(folder: Path) -> tuple[dict[str, Path], KeypointReader] | None:
-    """Files of single images in a camera's folder, by the image's name, and their reader.
-
-    None if the folder has no such file.
-    """
-    paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    for reader in readers():
-        matched = reader.match_images(sorted(paths))
-        if matched:
-            return matched, reader
-    return None
-
-
-def keypoint_paths(folder: Path, camera: str) -> tuple[Path | None, list[Path]]:
-    """The file of all images of a camera, if there is one, and the files of single images."""
-    whole = find_camera_file(folder, camera)
-    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
-    return whole[0] if whole else None, sorted(single[0].values()) if single else []
+    reading = recognise_layout(read_as(layout), read_as, folder)
+    return reading, reading.finish(folder, full_confidence)
 
 
 def read_camera(
@@ -332,23 +133,20 @@ def read_camera(
         full_confidence: confidence that counts as 1.
         layout: name of the layout of the points, None = recognised.
     """
+    files = KeypointFiles.find(folder, images.name)
+    files.refuse_both()
 
-    def read_as(name: str | None) -> _Reading:
-        reading = _Reading(images, name)
-        whole = find_camera_file(folder, images.name)
-        if whole is not None:
-            _add_camera_file(reading, *whole)
+    def add(reading: PeopleReading) -> None:
+        if files.whole is not None:
+            _add_camera_file(reading, files.whole, files.reader)
         elif (folder / images.name).is_dir():
-            _add_image_files(reading, folder / images.name)
+            _add_image_files(reading, files)
         else:
             reading.notes.append(
                 f"no keypoints {folder.name}/{images.name}/ or {folder.name}/{images.name}.json"
             )
-        return reading
 
-    refuse_both(*keypoint_paths(folder, images.name))
-    reading = _recognise_layout(read_as(layout), read_as, folder)
-    return reading.finish(folder, images.name, full_confidence)
+    return _read(folder, images, layout, full_confidence, add)[1]
 
 
 def read_files(
@@ -361,17 +159,11 @@ def read_files(
 ) -> PeopleByImage:
     """Read the JSON file of each image number, None = there is none; raises as read_camera."""
     reader = next(reader for reader in readers() if reader.load is read_json)
-
-    def read_as(name: str | None) -> _Reading:
-        reading = _Reading(images, name)
-        _add_files(reading, files, reader)
-        return reading
-
-    reading = _recognise_layout(read_as(layout), read_as, folder)
-    return reading.finish(folder, images.name, full_confidence)
+    add = partial(_add_files, files=files, reader=reader)
+    return _read(folder, images, layout, full_confidence, add)[1]
 
 
-def _add_camera_file(reading: _Reading, path: Path, reader: KeypointReader) -> None:
+def _add_camera_file(reading: PeopleReading, path: Path, reader: KeypointReader) -> None:
     """Read one file of all images and sort its people by image."""
     try:
         loaded = reader.load(path)
@@ -391,10 +183,9 @@ def _add_camera_file(reading: _Reading, path: Path, reader: KeypointReader) -> N
     note_absent(reading.notes, absent, reading.images, short_name(path))
 
 
-def _add_image_files(reading: _Reading, folder: Path) -> None:
-    """Read the files of a camera's folder."""
-    images = reading.images
-    by_name, reader = find_image_files(folder) or ({}, readers()[0])
+def _add_image_files(reading: PeopleReading, files: KeypointFiles) -> None:
+    """Read the files of single images."""
+    images, by_name = reading.images, files.single
     places, remark = images.recognise_names(by_name)
     repeated = [] if places else find_repeated_number(by_name)
     if repeated:
@@ -404,12 +195,14 @@ def _add_image_files(reading: _Reading, folder: Path) -> None:
         reading.recognised.append(f"keypoint files are {remark}")
     by_number = {place: by_name[name] for name, place in places.items()}
     numbers = [int(images.number[t]) for t in images.sets]
-    _add_files(reading, {n: by_number.get(n) for n in numbers}, reader)
+    _add_files(reading, {n: by_number.get(n) for n in numbers}, files.reader)
     absent = [name for name in by_name if places.get(name) not in images.recorded]
     note_unmatched(reading.notes, "keypoint files", absent)
 
 
-def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: KeypointReader) -> None:
+def _add_files(
+    reading: PeopleReading, files: Mapping[int, Path | None], reader: KeypointReader
+) -> None:
     """Read the file of each image number."""
     missing = 0
     for number, path in files.items():
@@ -434,42 +227,13 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
         reading.notes.append(f"no keypoint file for {missing} images")
 
 
-def _load_first(
-    folder: Path, camera: str, notes: list[str], load: Callable[[Path], Any] = read_head
-) -> tuple[dict[Path, Any], KeypointReader] | None:
-    """Load the beginning of a camera's file, or some of its files of one image.
-
-    Returns the contents by path and the files' reader, or None without files. ``load`` parses JSON;
-    files that cannot be loaded are added to ``notes``.
-    """
-    whole = find_camera_file(folder, camera)
-    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
-    if whole is not None:
-        paths, reader = [whole[0]], whole[1]
-    elif single is not None:
-        files = sorted(single[0].values())
-        paths, reader = files[:: -(-len(files) // FILES_PREVIEWED)], single[1]
-    else:
-        return None
-    loaded: dict[Path, Any] = {}
-    for path in paths:
-        try:
-            content = load(path) if reader.load is read_json else reader.load(path)
-        except UnreadableDetections as error:
-            notes.append(f"{path} {error}")
-            continue
-        if content is not None:
-            loaded[path] = content
-    return loaded, reader
-
-
 def holds_people(folder: Path, camera: str) -> bool:
     """Whether the first files of a camera hold keypoints of a person."""
-    loaded, reader = _load_first(folder, camera, [], read_first) or ({}, readers()[0])
-    one_image = find_camera_file(folder, camera) is None
-    for content in loaded.values():
+    files = KeypointFiles.find(folder, camera)
+    for content in files.load_first([], read_first).values():
         try:
-            if read_people(content, reader.load, one_image=one_image).results:
+            one_image = files.whole is None
+            if read_people(content, files.reader.load, one_image=one_image).results:
                 return True
         except UnreadableDetections:
             continue
@@ -481,30 +245,23 @@ def preview_keypoints(
 ) -> DetectionPreview:
     """Read the beginning of one camera's file, or some of its files of one image.
 
-    Args:
-        folder: folder of keypoints of the sequence.
-        images: the camera's images.
-        full_confidence: confidence that counts as 1.
-        layout: name of the layout of the points, None = recognised.
+    Arguments as of :func:`read_camera`.
     """
     preview = DetectionPreview()
-    whole = find_camera_file(folder, images.name)
-    single = find_image_files(folder / images.name) if (folder / images.name).is_dir() else None
-    if whole is None and single is not None:
-        preview_names(preview, folder / images.name, single[0], images)
+    files = KeypointFiles.find(folder, images.name)
+    if files.whole is None and files.single:
+        preview_names(preview, folder / images.name, files.single, images)
     unreadable: list[str] = []
-    first = _load_first(folder, images.name, unreadable)
+    loaded = files.load_first(unreadable)
     preview.notes += unreadable
-    if first is None:
+    if not files.used:
         return preview
-    loaded, reader = first
 
-    def read_as(name: str | None) -> _Reading:
-        reading = _Reading(images, name)
+    def add(reading: PeopleReading) -> None:
         entries = 0
         faults: list[str] = []
         for number, (path, content) in enumerate(loaded.items()):
-            parsed = reading.parse(content, reader, path, one_image=whole is None)
+            parsed = reading.parse(content, files.reader, path, one_image=files.whole is None)
             if parsed is not None:
                 entries, faults = entries + parsed.entries, faults + parsed.faults
                 people = [person for _, person in parsed.results]
@@ -514,12 +271,10 @@ def preview_keypoints(
             reading.notes.append(
                 f"{len(faults)} of its first {entries} people cannot be used (first: {faults[0]})"
             )
-        return reading
 
     try:
-        refuse_both(*keypoint_paths(folder, images.name))
-        reading = _recognise_layout(read_as(layout), read_as, folder)
-        found = reading.finish(folder, images.name, full_confidence)
+        files.refuse_both()
+        reading, found = _read(folder, images, layout, full_confidence, add)
     except UserError as error:
         preview.faults.append(str(error))
         return preview

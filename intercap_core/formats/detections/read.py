@@ -202,42 +202,29 @@ class Detections:
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
         """The image's segmentation candidates, in the order of the artefacts."""
-        table = self._from_images
-        if table is None:
-            return self._of_detector(t, c)
-        found = [] if table.alone else self._of_detector(t, c)
-        image = t * len(self.camera_names) + c
-        first, last = table.offsets[image : image + 2].tolist()
-        width, height = self.image_sizes[c].tolist()
-        return found + [
-            Candidate(
-                index=len(found) + i - first,
-                label=UNKNOWN_LABEL,
-                score=float(table.scores[i]),
-                rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
-                image_size=(width, height),
-                extent_m=float(table.extents[i]),
-            )
-            for i in range(first, last)
-        ]
+        table, added = self._tables[c], self._from_images
+        image, count = self._image(t, c), len(self.camera_names)
+        found: list[Candidate] = []
+        if image >= 0 and (added is None or not added.alone):
+            first, last = table.candidate_offsets[image : image + 2].tolist()
+            found = [self._candidate(table, c, i, i - first) for i in range(first, last)]
+        if added is not None:
+            first, last = added.offsets[t * count + c : t * count + c + 2].tolist()
+            start = len(found) - first
+            found += [self._candidate(added, c, i, start + i) for i in range(first, last)]
+        return found
 
-    def _of_detector(self, t: int, c: int) -> list[Candidate]:
-        """The detector's candidates of the image."""
-        table, image = self._tables[c], self._image(t, c)
-        if image < 0:
-            return []
-        first, last = table.candidate_offsets[image : image + 2].tolist()
+    def _candidate(self, table: _CameraTable | _ImageTable, c: int, row: int, at: int) -> Candidate:
+        """Candidate of camera ``c`` in a row of ``table``, at position ``at`` in its image."""
         width, height = self.image_sizes[c].tolist()
-        return [
-            Candidate(
-                index=i - first,
-                label=table.labels[i],
-                score=float(table.scores[i]),
-                rle=table.rle[table.rle_offsets[i] : table.rle_offsets[i + 1]],
-                image_size=(width, height),
-            )
-            for i in range(first, last)
-        ]
+        return Candidate(
+            index=at,
+            label=table.labels[row] if isinstance(table, _CameraTable) else UNKNOWN_LABEL,
+            score=float(table.scores[row]),
+            rle=table.rle[table.rle_offsets[row] : table.rle_offsets[row + 1]],
+            image_size=(width, height),
+            extent_m=float("nan") if isinstance(table, _CameraTable) else float(table.extents[row]),
+        )
 
 
 def _read_camera(artefact: artefacts.Artefact, name: str) -> _CameraTable:

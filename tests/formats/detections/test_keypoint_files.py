@@ -12,12 +12,9 @@ import pytest
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.formats.detections.keypoint_files import (
-    KeypointCleaner,
-    preview_keypoints,
-    read_camera,
-)
+from intercap_core.formats.detections.keypoint_files import preview_keypoints, read_camera
 from intercap_core.formats.detections.keypoints.coco import WHOLE_BODY
+from intercap_core.formats.detections.people_of_camera import KeypointCleaner
 
 SIZE = (1920, 1080)
 COUNT = 4
