@@ -36,6 +36,11 @@ from bench.evaluate.workflows import (
     print_minutes,
 )
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.files import calibration_readers
+from intercap_core.formats.detections.keypoints import readers as keypoint_readers
+from intercap_core.formats.recordings.layouts import INPUTS
+from intercap_core.formats.recordings.ros.layout import SCHEMES
+from intercap_core.output.export.registry import formats as export_formats
 from intercap_core.project import load_project
 from intercap_core.studio.mediapipe import mediapipe_python
 
@@ -104,7 +109,7 @@ def evaluate(
     minutes |= {f"{name}_minutes_budget": PARTS[name].budget_minutes for name in wanted}
     duration = (time.monotonic() - begin) / 60
     print_minutes(list(projects), minutes, duration)
-    figures["constants.total"] = total_constants()
+    figures |= {"constants.total": total_constants()} | format_counts()
     print(f"constants of the package: {figures['constants.total']}")
     figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
     flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
@@ -112,6 +117,19 @@ def evaluate(
     output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(output)
     return status
+
+
+def format_counts() -> Figures:
+    """Numbers of formats that are read and written, ``formats.read`` and ``formats.written``.
+
+    Read are layouts of recordings (of bags one for each recorder), calibrations of other tools and
+    files of keypoints. Written are the formats of the export.
+    """
+    recordings = len(set(INPUTS) - {"ros"}) + len(SCHEMES)
+    return {
+        "formats.read": recordings + len(calibration_readers()) + len(keypoint_readers()),
+        "formats.written": len(export_formats()),
+    }
 
 
 def evaluate_quick(output: Path, *, cores: int = 0, renew_reference: bool = False) -> int:
