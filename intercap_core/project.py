@@ -224,13 +224,13 @@ def read_project(
     subjects_table = tidy(path.parent / config.subjects)
     people = read_table(subjects_table, SubjectEntry, "subject", path, faults)
     objects_file = tidy(path.parent / config.objects)
-    things = _read_objects(objects_file, path, faults)
+    entries = _read_objects(objects_file, path, faults)
     table = tidy(path.parent / config.sequences)
     rows = read_table(
         table, SequenceEntry, "sequence", path, faults, references=("subject", "object")
     )
     listed: dict[str, tuple[Mapping[str, BaseModel | None], Path]] = {
-        "subject": (people, subjects_table), "object": (things, objects_file),
+        "subject": (people, subjects_table), "object": (entries, objects_file),
     }  # fmt: skip
     valid: dict[str, SequenceEntry] = {}
     for name, row in rows.items():
@@ -258,7 +258,7 @@ def read_project(
             f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
         )
     subjects = {name: row for name, row in people.items() if row is not None}
-    objects = {name: entry for name, entry in things.items() if entry is not None}
+    objects = {name: entry for name, entry in entries.items() if entry is not None}
     project = Project(config, path, valid, subjects, objects, frozenset(rows))
     faults += [*_faults_of_files(project), *_faults_of_studio(project, rows, table)]
     return project, faults

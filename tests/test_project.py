@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from intercap_core.annotation import Annotation
-from intercap_core.commands.docs import contents
 from intercap_core.config import Config, digest
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
+from tools.generated_docs import contents
 
 ROOT = Path(__file__).resolve().parents[1]
 HEADER = "sequence\tsubject\tobject\trecordings\tcalibration\n"

@@ -22,7 +22,8 @@ from rich.console import Console
 from bench.evaluate.part import Figures, Targets
 from intercap_core.commands.check import check_bodies
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.run import POLL_SECONDS, Watcher, snakemake_command
+from intercap_core.commands.run import POLL_SECONDS, snakemake_command
+from intercap_core.commands.watcher import Watcher
 from intercap_core.errors import UserError
 from intercap_core.pipeline.stage_inputs import STUDIO
 from intercap_core.project import Project

@@ -1,6 +1,6 @@
 """`intercap dev`: commands for the development of this program.
 
-Evaluation and benchmarks are in the folder ``bench`` of a checkout.
+Their code is in the folders ``bench`` and ``tools`` of a checkout.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ Part = Literal[
 ]  # fmt: skip
 
 
-def _bench(name: str) -> Any:
-    """Import the module ``bench.<name>``; raises UserError outside of a checkout."""
+def _of_checkout(name: str) -> Any:
+    """Import a module of ``bench`` or ``tools``; raises UserError outside of a checkout."""
     try:
-        return import_module(f"bench.{name}")
+        return import_module(name)
     except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("bench"):
+        if not name.startswith(error.name or "-"):
             raise
         raise UserError(
-            "this command needs a checkout of the repository, which has the folder bench; run "
-            "`make environment` in it and use its .venv/bin/intercap"
+            "this command needs a checkout of the repository, which has the folders bench and "
+            "tools; run `make environment` in it and use its .venv/bin/intercap"
         ) from None
 
 
@@ -124,7 +124,7 @@ def evaluate(
         raise UserError("--quick is a fixed set; leave out --quick or --seed")
     if update_reference and not quick:
         raise UserError("--update-reference records the quick set; add --quick")
-    evaluation = _bench("evaluate.run")
+    evaluation = _of_checkout("bench.evaluate.run")
     if quick:
         status = evaluation.evaluate_quick(output, cores=cores, renew_reference=update_reference)
         raise typer.Exit(status)
@@ -150,7 +150,7 @@ def bench(
     Example: intercap dev bench
     """
     check_output(output, replace_any=True)
-    _bench("workflow_speed").measure(settings, output, cores=cores)
+    _of_checkout("bench.workflow_speed").measure(settings, output, cores=cores)
 
 
 @app.command()
@@ -171,9 +171,7 @@ def docs(
     check_only: Annotated[bool, typer.Option("--check", help="Only list stale files.")] = False,
 ) -> None:
     """Write the files that are generated from code: settings, schemas, pages on result files."""
-    from intercap_core.commands.docs import generate
-
-    stale = generate(root, write=not check_only)
+    stale = _of_checkout("tools.generated_docs").generate(root, write=not check_only)
     for path in stale:
         typer.echo(f"{'stale' if check_only else 'written'}: {path}")
     if check_only and stale:

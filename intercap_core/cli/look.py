@@ -126,7 +126,7 @@ def view(
             f"{settings}: name one of its sequences: {', '.join(project.sequences)}; "
             f"intercap view {settings} SEQUENCE"
         )
-    from intercap_core.commands.view import view as write_view
+    from intercap_core.commands.pictures import view as write_view
 
     typer.echo(write_view(project, sequence, output, show=show))
 
@@ -151,7 +151,7 @@ def closeups(
     intercap closeups config/demo/config.yaml cup_drink_s02 --output cup
     """
     prepare()
-    from intercap_core.commands.closeups import draw_closeups
+    from intercap_core.commands.pictures import draw_closeups
 
     written, empty = draw_closeups(settings, sequences or [], output)
     for path in written:

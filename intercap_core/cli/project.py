@@ -314,7 +314,7 @@ def report(settings: SettingsOrDefault) -> None:
     Example: intercap report config/demo/config.yaml
     """
     project = open_project(settings)
-    from intercap_core.commands.report import write_site
+    from intercap_core.pipeline.step import write_site
 
     typer.echo(write_site(project))
 

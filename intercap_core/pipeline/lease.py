@@ -83,11 +83,11 @@ class Lease:
             return self._owner.token in self._path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return False
-        except OSError:  # a file system that does not answer for a moment
+        except OSError:  # a file system that is temporarily unavailable
             return True
 
     def release(self) -> None:
-        """End the heartbeat and remove the file, unless it belongs to another process by now."""
+        """End the heartbeat and remove the file, unless another process has taken it over."""
         self._released.set()
         self._thread.join()
         if self.is_held():

@@ -270,3 +270,19 @@ def run_dataset(project: Project) -> Path:
         remember_output(folder)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first
+
+
+def write_site(project: Project) -> Path:
+    """Write missing and stale summaries and pages and the site's first page; returns its path.
+
+    Sequences that cannot be reported are left out with a warning. Raises UserError if none is left.
+    """
+    for name in project.sequences:
+        for stage in ("summary", "page"):
+            if not all(project.artefact(name, read).is_file() for read in STAGES[stage].reads):
+                continue
+            try:
+                run_step(stage, project, name, keep=True)
+            except UserError as error:
+                log.warning("sequence %s has no %s: %s", name, stage, error)
+    return run_dataset(project)

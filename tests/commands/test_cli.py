@@ -26,7 +26,7 @@ from intercap_core.commands.check import (
     check_sequences,
 )
 from intercap_core.commands.console import ListTable
-from intercap_core.commands.run import Watcher
+from intercap_core.commands.watcher import Watcher
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.project import load_project, root_of

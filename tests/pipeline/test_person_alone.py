@@ -16,8 +16,8 @@ import pytest
 from bench.evaluate import field
 from bench.evaluate.part import Measured
 from intercap_core.commands.check import check_sequences
-from intercap_core.commands.closeups import draw_closeups
 from intercap_core.commands.inspect import print_summary
+from intercap_core.commands.pictures import draw_closeups
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
 from intercap_core.joint.problem import TERMS

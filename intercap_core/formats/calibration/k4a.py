@@ -171,7 +171,7 @@ def _sensors(content: bytes, group: str, key: str) -> dict[str, dict[str, Any]]:
         raise ValueError(f"CalibrationInformation is {quoted(information, 40)}, expected an object")
     entries = {entry[key]: entry for entry in information.get(group, [])}
     if not all(isinstance(entry, dict) for entry in entries.values()):
-        raise ValueError(f"{group} lists something else than sensors")
+        raise ValueError(f"{group} lists an entry that is no sensor")
     return entries
 
 

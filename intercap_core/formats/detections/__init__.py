@@ -1,4 +1,4 @@
-"""Detections of people and things: files of other programs, ONNX models, and their artefact.
+"""Detections of people and objects: files of other programs, ONNX models, and their artefact.
 
 - ``image_numbers``: which colour image a file or an entry of a file is about.
 - ``keypoint_files``, ``people_of_camera``, ``keypoints``: keypoints of one camera; their layout and

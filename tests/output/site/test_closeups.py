@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from intercap_core.commands.closeups import draw_closeups
+from intercap_core.commands.pictures import draw_closeups
 from intercap_core.errors import UserError
 from intercap_core.output.site import closeups
 from intercap_core.output.site.closeups import Handling, Hold

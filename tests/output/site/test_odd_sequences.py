@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from intercap_core.commands.report import write_site
 from intercap_core.errors import UserError
+from intercap_core.pipeline.step import write_site
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import METRICS
 from tests.helpers import fitted_capture as fitted
