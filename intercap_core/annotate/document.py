@@ -36,12 +36,7 @@ _PART = ".part"
 
 
 class Changed(UserError):
-    """The file changed since it was read.
-
-    Args:
-        now: the file's present content.
-        difference: unified diff from the content that was read.
-    """
+    """The file changed since it was read; ``difference`` is the unified diff to its content."""
 
     def __init__(self, now: Document, difference: str) -> None:
         super().__init__(f"{now.path}: was changed by another annotator; nothing was saved")

@@ -8,8 +8,9 @@ import shutil
 import socket
 import tempfile
 import webbrowser
-from collections.abc import Callable
 from pathlib import Path
+
+import typer
 
 from intercap_core.errors import UserError
 
@@ -18,26 +19,15 @@ HOST = "127.0.0.1"
 
 def serve(
     settings: Path,
-    sequence: str | None = None,
+    sequence: str | None,
     *,
-    port: int = 0,
-    by: str = "",
-    cores: int = 0,
-    profile: Path | None = None,
-    show: bool = False,
-    say: Callable[[str], None] = print,
+    port: int,
+    by: str,
+    cores: int,
+    profile: Path | None,
+    show: bool,
 ) -> None:
-    """Serve the page until the process is interrupted.
-
-    Args:
-        settings: the project's config.yaml.
-        sequence: sequence to open, by default the list of sequences.
-        port: 0 for any free port.
-        by: name of the annotator.
-        cores: number of cores of runs, 0 for all.
-        profile: Snakemake profile of a cluster.
-        show: open the default browser.
-        say: prints the address and instructions.
+    """Serve the page until the process is interrupted; arguments as of `intercap annotate`.
 
     Raises UserError if the project has a fault, the port is in use or a library is missing.
     """
@@ -66,10 +56,10 @@ def serve(
         used = listening.getsockname()[1]
         where = f"/sequence/{sequence}" if sequence else "/"
         address = f"http://{HOST}:{used}{where}#token={token}"
-        say(f"open {address}")
+        typer.echo(f"open {address}")
         tunnel = f"ssh -L {used}:{HOST}:{used} {socket.gethostname()}"
-        say(f"from another machine: {tunnel}, then the same address")
-        say("anybody with the address may change annotations; Ctrl+C ends the server")
+        typer.echo(f"from another machine: {tunnel}, then the same address")
+        typer.echo("anyone who has this address can change annotations; Ctrl+C ends the server")
         if show:
             _show(address)
         options = uvicorn.Config(
@@ -81,7 +71,9 @@ def serve(
         finally:
             annotator.runs.stop()
             if annotator.runs.in_progress:
-                say(f"the run of {annotator.runs.sequence} is ending; finished results are kept")
+                typer.echo(
+                    f"the run of {annotator.runs.sequence} is ending; finished results are kept"
+                )
                 annotator.runs.wait()
 
 

@@ -93,10 +93,7 @@ def annotate(
 
     settings, sequence = find_sequence(settings, sequence)
     with suppress(Terminated):  # Ctrl-C is the normal way to end the server
-        serve(
-            settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
-            say=lambda line: typer.echo(line),
-        )  # fmt: skip
+        serve(settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show)
 
 
 @app.command()

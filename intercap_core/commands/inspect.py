@@ -17,10 +17,8 @@ from intercap_core.evaluation.flags import ranges
 def print_summary(path: Path, *, verify: bool = False) -> None:
     """Print attributes, datasets, the number of set flags and the texts.
 
-    Args:
-        verify: read every dataset, which checks the checksums.
-
-    Raises UserError if the file is no complete artefact or a checksum is wrong.
+    ``verify`` reads every dataset, which checks the checksums. Raises UserError if the file is no
+    complete artefact or a checksum is wrong.
     """
     known = {s.name: s for s in vars(schemas).values() if isinstance(s, artefacts.Schema)}
     name = artefacts.schema_name(path)

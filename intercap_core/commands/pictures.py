@@ -13,13 +13,9 @@ from intercap_core.project import Project, load_project
 
 
 def view(project: Project, sequence: str, output: Path | None = None, *, show: bool = True) -> Path:
-    """Write a page with the sequence's viewer; returns its path.
+    """Write a page with the sequence's viewer into ``output``; returns its path.
 
     Raises UserError if the artefact of frames, scene or body_fit is missing, or one is damaged.
-
-    Args:
-        output: folder of the page; default: ``view`` next to the sequence's artefacts.
-        show: open the page in the browser.
     """
     paths = project.paths(sequence)
     for needed in (paths.frames, paths.scene, paths.body_fit):
@@ -49,13 +45,8 @@ def draw_closeups(
 ) -> tuple[list[Path], list[str]]:
     """Draw every hand contact of ``sequences``, of all sequences if none is named.
 
-    Raises UserError if a sequence is unknown or has no joint fit.
-
-    Args:
-        output: folder of the pictures; default: ``closeups`` in the project's results.
-
-    Returns:
-        The written pictures, and the names of the sequences without a hand contact.
+    Returns the written pictures, and the names of the sequences without a hand contact. Raises
+    UserError if a sequence is unknown or has no joint fit.
     """
     project = load_project(settings)
     folder = output or project.results / "closeups"

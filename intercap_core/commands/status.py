@@ -102,9 +102,8 @@ def _not_done(
 def print_status(project: Project, *, every: bool = False, as_json: bool = False) -> None:
     """Print counts, a table of the sequences that are not done, and the reasons.
 
-    Args:
-        every: include the sequences that are done.
-        as_json: print all states as JSON instead.
+    With ``every``, the table includes the sequences that are done. With ``as_json``, all states are
+    printed as JSON instead.
     """
     current = status(project)
     if as_json:

@@ -30,7 +30,6 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
 
     Args:
         root: folder with ``sequences``, ``calibs`` and ``objects``.
-        dataset: name of the project.
         results: folder of the data set's own results, which are converted instead of a joint fit:
             ``root`` (registrations in the frames' folders), or the parameters at 30 frames a second
             with their meshes. It has a folder for each sequence, directly or in ``sequences``.

@@ -49,7 +49,6 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
     Args:
         root: the folder ``RGBD_Images``, or the one that holds it.
         sources: the other folders of the release.
-        dataset: name of the project.
         objects: objects.yaml to use instead of the release's meshes; None = that of the package
             if there are no meshes.
     """

@@ -72,7 +72,6 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path | None) -
     Args:
         root: folder of recordings.
         sources: folders of keypoints, candidates and meshes outside of ``root``.
-        dataset: name of the project.
         objects: objects.yaml to use; None = found in ``root``, or written for its meshes.
     """
     found = list(find_recordings(root))

@@ -87,10 +87,7 @@ def read_calibration(
     Raises UserError as the format's reader does. :mod:`.opencv` defines its files in metres, so a
     ``scale`` for them raises UserError too.
 
-    Args:
-        path: file or folder.
-        recorded: names and image sizes of the recorded cameras.
-        scale: metres for one unit of the file, None = not stated.
+    ``scale``: metres for one unit of the file, None = not stated.
     """
     calibration = read_tool_calibration(path, recorded or RecordedCameras(), scale)
     if calibration is not None:

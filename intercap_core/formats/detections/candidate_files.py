@@ -74,11 +74,6 @@ def image_files(folder: Path, camera: str) -> list[Path]:
     return [] if camera_file(folder, camera) is not None else find_json_files(folder / camera)
 
 
-def has_candidates(folder: Path, camera: str, layout: str) -> bool:
-    """Whether there is any file for the camera."""
-    return bool(candidate_paths(folder, camera, layout))
-
-
 def candidate_paths(folder: Path, camera: str, layout: str) -> list[Path]:
     """All files of a camera that are read."""
     whole = camera_file(folder, camera)
@@ -93,7 +88,7 @@ def holds_instances(folder: Path, camera: str, layout: str) -> bool:
     """Whether the first file of a camera lists results of instance segmentation, or is a mask."""
     path = camera_file(folder, camera) or next(iter(image_files(folder, camera)), None)
     if path is None:
-        return has_candidates(folder, camera, layout)
+        return bool(candidate_paths(folder, camera, layout))
     try:
         content = read_first(path)
         return bool(parse_candidates(content, CandidateForm((1, 1), {}, 0.0)).entries)
@@ -114,14 +109,12 @@ def read_camera(
     Raises UserError if a camera has a file of all images and also files of single images.
 
     Args:
-        folder: folder of candidates of the sequence.
-        images: the camera's images.
         layout: layout of the recordings.
         min_score: instances with a lower score are left out.
         names: classes by number, for files that do not list them.
     """
     candidates = CandidatesByImage()
-    if not has_candidates(folder, images.name, layout):
+    if not candidate_paths(folder, images.name, layout):
         candidates.notes.append(f"no candidates {folder.name}/{images.name}.json")
         return candidates
     form = CandidateForm(images.size, names, min_score)
@@ -193,12 +186,9 @@ def _add_image_files(
 def _notes_on_place(
     files: list[CandidateFile], size: tuple[int, int], where: str = ""
 ) -> list[str]:
-    """Notes on masks that were scaled, and on probable masks of other images.
+    """Notes on masks that were scaled, and on probable masks of images of another size.
 
-    Args:
-        files: the results of one camera.
-        size: width and height of its images.
-        where: words after "masks".
+    ``where`` follows the word "masks" in the notes.
     """
     notes = []
     scaled, shares = sum(file.scaled for file in files), sum(file.shares for file in files)
@@ -267,12 +257,7 @@ def preview_candidates(
 ) -> DetectionPreview:
     """Read the beginning of one camera's file, or the first of its files of one image.
 
-    Masks as image files are not read.
-
-    Args:
-        folder: folder of candidates of the sequence.
-        images: the camera's images.
-        names: classes by number.
+    Masks as image files are not read. ``names``: classes by number.
     """
     preview = DetectionPreview()
     size = images.size

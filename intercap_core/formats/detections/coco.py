@@ -141,13 +141,8 @@ def parse_candidates(
 ) -> CandidateFile:
     """The results in parsed JSON (:func:`read_json`), in order.
 
-    Results that cannot be used are left out and reported as faults. Raises
-    :class:`UnreadableDetections` if nothing can be used.
-
-    Args:
-        content: the parsed JSON.
-        form: images, classes and the least score.
-        one_image: entries need not state their image.
+    Results that cannot be used are left out and reported as faults. With ``one_image``, entries
+    need not state their image. Raises :class:`UnreadableDetections` if nothing can be used.
     """
     entries = content
     images: list[ImageKey] | None = None
@@ -295,14 +290,9 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
 def image_of(
     entry: dict[str, Any], listed: Mapping[int | str, ImageKey], one_image: bool
 ) -> ImageKey:
-    """The image of an entry.
+    """The image of an entry; ``listed``: images by id and by name.
 
-    Raises ValueError if the entry must state its image and does not.
-
-    Args:
-        entry: the entry.
-        listed: images by id and by name.
-        one_image: the entry need not state its image.
+    Raises ValueError if the entry does not state its image, unless the file is of ``one_image``.
     """
     value, name = entry.get("image_id"), entry.get("file_name", entry.get("image_path"))
     if isinstance(value, str):

@@ -118,10 +118,7 @@ def hint_on_size(outside: int, total: int) -> str:
 def notes_on_extent(kind: str, extent: float, size: tuple[int, int]) -> list[str]:
     """Note if all detections lie in the upper left quarter of an image of ``size``.
 
-    Args:
-        kind: name of the detections.
-        extent: largest coordinate as a share of the image's width or height; 0 without any.
-        size: width and height.
+    ``extent``: largest coordinate as a share of the image's width or height; 0 without detections.
     """
     if not 0 < extent < 0.5:
         return []

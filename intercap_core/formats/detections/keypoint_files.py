@@ -128,8 +128,6 @@ def read_camera(
     recognised. Files that cannot be loaded are noted.
 
     Args:
-        folder: folder of keypoints of the sequence.
-        images: the camera's images.
         full_confidence: confidence that counts as 1.
         layout: name of the layout of the points, None = recognised.
     """

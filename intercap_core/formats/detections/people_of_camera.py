@@ -223,12 +223,8 @@ def recognise_layout(
 ) -> PeopleReading:
     """Compare the assumed layout with the people's bones; read again if another one fits.
 
-    Raises UserError if no layout of the same number of points fits.
-
-    Args:
-        reading: all people of a camera.
-        read_as: reads them in the named layout.
-        folder: folder of keypoints, for messages.
+    ``read_as`` reads them in the layout of a name. Raises UserError, naming the ``folder``, if no
+    layout of the same number of points fits.
     """
     share = compare_bones(reading.people)
     if reading.layout is not None or len(reading.assumed) != 1 or share is None:

@@ -119,14 +119,10 @@ def readers() -> tuple[KeypointReader, ...]:
 
 
 def find_layout(count: int, name: str | None = None) -> KeypointLayout:
-    """The layout of a person with ``count`` points.
+    """The layout of a person with ``count`` points; ``name`` if the file states it.
 
     Raises ValueError if there is none. The message continues a sentence that begins with the name
     of the person or the model.
-
-    Args:
-        count: number of points.
-        name: name of the layout if the file states it.
     """
     if name is not None:
         if not isinstance(name, str) or name not in layouts():  # from a user's file
@@ -242,9 +238,7 @@ def read_people(
     Raises :class:`UnreadableDetections` if there is none, or as the reader does.
 
     Args:
-        content: content as ``load`` returns it.
         load: function that loaded the file.
-        one_image: the file is of one image.
         layout: name of the layout according to the settings.
     """
     possible = [
