@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.lens_checks import MIN_METRIC_RADIUS, find_lens_fault
 from intercap_core.formats.calibration.opencv import (
     MAX_LENSES_APART_M,
-    MIN_METRIC_RADIUS,
-    find_lens_fault,
 )
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.rig import Camera

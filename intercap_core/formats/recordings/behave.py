@@ -22,7 +22,7 @@ from intercap_core.formats.calibration.extrinsics import (
     Extrinsics,
     relate_to_master,
 )
-from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
+from intercap_core.formats.calibration.lens_checks import check_lens, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
 from intercap_core.formats.recordings.numbering import FRAME_FOLDER
 from intercap_core.formats.recordings.source import RecordingLayout

@@ -17,7 +17,11 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.opencv import check_lens, check_resolution, pad_distortion
+from intercap_core.formats.calibration.lens_checks import (
+    check_lens,
+    check_resolution,
+    pad_distortion,
+)
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics

@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.lens_checks import turning_radius
 from intercap_core.formats.calibration.opencv import (
     opencv_lens,
     read_opencv_calibration,
-    turning_radius,
 )
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "recordings.md"
