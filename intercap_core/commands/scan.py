@@ -38,7 +38,7 @@ from intercap_core.stages import object_track
 
 READ = ("frames", "detections", "scene", "person")
 ROUNDS = 2  # of tracking and fusion; the second one tracks with a mesh of all frame sets
-TRACKED_VOXELS, TRACKED_FACES = 100, 1500  # along the mesh that is tracked; of it
+TRACKED_VOXELS, TRACKED_FACES = 5e5, 1500  # of the grid and of the mesh that is tracked
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
 MIN_EXPLAINED = 0.9  # least share of the object's points on the mesh
@@ -225,7 +225,7 @@ def _scan(
     if len(shown) == 1 and is_still(shown[0]):
         parts = [Posed(recordings[0], shown[0], dict.fromkeys(shown[0], poses[seed]))]
         return finish(fuse(parts, up=up), parts, up)
-    surface = fuse([Posed(recordings[0], shown[0], poses)], up=up, along=TRACKED_VOXELS)
+    surface = fuse([Posed(recordings[0], shown[0], poses)], up=up, voxels=TRACKED_VOXELS)
     for round_ in range(ROUNDS):
         entry = _tracked_entry(surface, name, labels, places)
         parts = []
@@ -236,7 +236,7 @@ def _scan(
             _require_poses(parts[-1], name)
         poses = {seed: poses[seed]} | dict(parts[0].poses)
         last = round_ == ROUNDS - 1
-        surface = fuse(parts) if last else fuse(parts, along=TRACKED_VOXELS)
+        surface = fuse(parts) if last else fuse(parts, voxels=TRACKED_VOXELS)
     return finish(surface, parts, poses[seed][:3, :3].T @ up)
 
 

@@ -41,7 +41,7 @@ class LabelledDepth:
     """(h, w) float32: weight of the pixels that show the object."""
     pinhole: tuple[float, float, float, float]
     """fx, fy, cx, cy of the window, pixels; no distortion."""
-    depth_from_object: np.ndarray
+    depth_from_grid: np.ndarray
     """(4, 4), metres."""
 
 
@@ -60,7 +60,7 @@ class ClosedSurface:
 
 
 class Volume:
-    """Votes of all images in a grid of voxels, in the object's frame."""
+    """Votes of all images in a grid of voxels."""
 
     def __init__(self, low: np.ndarray, high: np.ndarray, voxel_m: float) -> None:
         """Cover the box between the corners ``low`` and ``high`` (3,), metres."""
@@ -77,7 +77,7 @@ class Volume:
         """Add the votes of one depth image."""
         _integrate(
             self._distance, self._total, self._near, self._empty, self.low, self.voxel_m,
-            image.depth, image.kind, image.weight, image.pinhole, image.depth_from_object,
+            image.depth, image.kind, image.weight, image.pinhole, image.depth_from_grid,
         )  # fmt: skip
 
     def exclude_below(self, normal: np.ndarray, offset: float) -> None:
@@ -88,7 +88,7 @@ class Volume:
         self._empty[below], self._near[below] = MIN_EMPTY, 0.0
 
     def surface(self) -> ClosedSurface:
-        """Closed surface of the largest part."""
+        """Closed surface of the largest part; without faces if all voxels are empty."""
         near = (self._near > 0) & (self._empty <= EMPTY_RATIO * self._near)
         empty = (self._empty >= min(MIN_EMPTY, self.sets)) & ~near
         value = np.where(near, self._distance / np.maximum(self._total, 1e-9), -BAND_M)
@@ -96,7 +96,8 @@ class Volume:
         for axis in range(3):  # outside the grid is empty
             for end in (0, -1):
                 value[tuple(end if k == axis else slice(None) for k in range(3))] = BAND_M
-        value = gaussian_filter(value, 1.0)
+        # Equal limits inside and outside: with larger values outside, smoothing removes thin rods
+        value = gaussian_filter(np.clip(value, -self.voxel_m, self.voxel_m), 1.0)
         corners = np.stack(np.meshgrid(*map(np.arange, self.size), indexing="ij"), -1)
         vertices, faces = igl.marching_cubes(
             value.ravel(order="F").astype(np.float64),
@@ -110,7 +111,7 @@ class Volume:
         measured = map_coordinates(near.astype(np.float32), vertices.T, order=1) > 0.25
         part = np.asarray(mesh.cluster_connected_triangles()[0])
         areas = trimesh.triangles.area(vertices[faces]) * measured[faces].all(1)
-        by_part = np.bincount(part, areas)
+        by_part = np.bincount(part, areas, minlength=1)
         largest = int(np.argmax(by_part))
         kept, number = np.unique(faces[part == largest], return_inverse=True)
         return ClosedSurface(

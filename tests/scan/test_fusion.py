@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.scan.fusion import Posed, fuse, vertex_colours
 from tests.scan.turned_object import Turned, turning
@@ -42,6 +43,21 @@ def test_a_thin_wall_keeps_its_two_sides() -> None:
     found = trimesh.Trimesh(surface.vertices, surface.faces)
     assert found.volume == pytest.approx(VESSEL.volume, rel=0.5)  # filled: five times as much
     assert np.median(abs(distances_mm(VESSEL, surface.vertices))) < 1.5
+
+
+def test_a_rod_of_a_centimetre_stays_whole() -> None:
+    """Three pixels wide, in the coarse grid of a first mesh."""
+    rod = trimesh.creation.cylinder(0.0055, 0.5)
+    surface = fuse([posed(rod, turning(6, 30.0), noise_m=0.002)], voxels=5e5)
+    found = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert found.volume == pytest.approx(rod.volume, rel=0.2)
+    assert np.ptp(surface.vertices[:, 2]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_depth_without_a_surface_is_refused() -> None:
+    above_all = 1.0
+    with pytest.raises(UserError, match=r"sequence turned: .* no surface"):
+        fuse([posed(BOX, turning(1, 0.0))], up=np.array([0.0, 0, 1]), ground=above_all)
 
 
 def test_what_no_camera_measured_is_closed_and_flagged() -> None:
