@@ -46,6 +46,10 @@ class BagFile:
     def __exit__(self, *error: object) -> None:
         self._writer.close()
 
+    def compress(self, mode: rosbag2.CompressionMode, form: rosbag2.CompressionFormat) -> None:
+        """Compress a bag of ROS 2; call before the ``with`` block."""
+        self._writer.set_compression(mode, form)
+
     def make(self, name: str, **fields: Any) -> Any:
         return self.store.types[name](**fields)
 

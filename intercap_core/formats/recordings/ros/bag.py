@@ -129,10 +129,16 @@ class Bag(ClosedOnExit):
             raise
         except Exception as error:  # a damaged file fails in any line of the library
             reason = " ".join(str(error).split())[:300] or type(error).__name__
+            if "ompression" in reason:
+                advice = "convert it without compression (rosbag decompress, ros2 bag convert)"
+            else:
+                repair = _REPAIR.get(self.path.suffix, _REPAIR[""])
+                advice = (
+                    f"if the recording was not ended properly, repair it ({repair}), else copy or "
+                    "record it again"
+                )
             raise UserError(
-                f"{self.path}: cannot be read as a ROS bag ({reason}); if the recording was not "
-                f"ended properly, repair it ({_REPAIR.get(self.path.suffix, _REPAIR[''])}), else "
-                "copy or record it again"
+                f"{self.path}: cannot be read as a ROS bag ({reason}); {advice}"
             ) from error
 
 

@@ -91,8 +91,9 @@ def choose_topic(bag: Bag, kind: str, topics: Sequence[str], preferred: Sequence
 
 def kind_of_topic(bag: Bag, topic: str) -> Kind:
     """Kind of a topic's images; raises UserError for an encoding that is not supported."""
+    message = bag.first(topic)
     try:
-        return kind_of(bag.first(topic))
+        return kind_of(message)
     except UserError as error:
         raise UserError(f"{bag.path}: topic {topic} {error}") from None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from pathlib import Path
 
 import cv2
@@ -262,130 +261,6 @@ def test_a_stated_baseline_gives_the_noise_of_stereo(tmp_path: Path, baseline: f
     with Frames.open(path) as read_back:
         found = read_back.rig[0].depth_noise
     assert found == pytest.approx(0.08 / (DEPTH_K[0, 0] * baseline) if baseline else 0.0)
-
-
-# --- bags that cannot be used ----------------------------------------------------------------
-
-
-def write(folder: Path, change) -> Path:
-    """A bag of one camera without lenses or images; ``change`` adds to it."""
-    with BagFile(folder / "walk", "mcap") as bag:
-        bag.transforms(k1_color=("map", np.eye(4)), k1_depth=("k1_color", COLOUR_FROM_DEPTH))
-        change(bag)
-    return folder
-
-
-def colour_of(bag: BagFile, encoding: str = "bgr8") -> None:
-    bag.image("/k1/color/image_raw", START_NS, "k1_color", colour_image(0), encoding)
-
-
-def lens_of(bag: BagFile, **fields) -> None:
-    bag.lens("/k1/color/camera_info", COLOUR_SIZE, COLOUR_K, "k1_color", **fields)
-
-
-def two_depth_streams(bag: BagFile) -> None:
-    write_camera(bag)
-    bag.lens("/k1/aligned_depth_to_color/camera_info", DEPTH_SIZE, DEPTH_K, "k1_color")
-    topic = "/k1/aligned_depth_to_color/image_raw"
-    bag.image(topic, START_NS, "k1_color", depth_image(0), "16UC1")
-
-
-def depth_elsewhere(bag: BagFile) -> None:
-    lens_of(bag)
-    colour_of(bag)
-    bag.lens("/k1/depth/camera_info", DEPTH_SIZE, DEPTH_K, "elsewhere")
-    bag.image("/k1/depth/image_raw", START_NS, "elsewhere", depth_image(0), "16UC1")
-
-
-FAULTY = {
-    "no CameraInfo": (
-        colour_of,
-        "no message on /k1/color/camera_info.*or state the colour lens in column calibration",
-    ),
-    "two depth streams": (two_depth_streams, "holds 2 streams of depth.*column topics"),
-    "unknown encoding": (
-        lambda bag: (lens_of(bag), colour_of(bag, "bayer_rggb8")),
-        "topic /k1/color/image_raw has images of encoding 'bayer_rggb8', expected",
-    ),
-    "unknown compression": (
-        lambda bag: (lens_of(bag), bag.compressed(
-            "/k1/color/image_raw/compressed", START_NS, "k1_color", b"1234", "rgb8; avif")),
-        "has images of format 'rgb8; avif', expected",
-    ),
-    "fisheye": (
-        lambda bag: (lens_of(bag, model="equidistant", d=(0.1, 0, 0, 0)), colour_of(bag)),
-        "distortion model is 'equidistant', expected plumb_bob",
-    ),
-    "no calibration": (
-        lambda bag: (bag.lens("/k1/color/camera_info", COLOUR_SIZE, np.zeros((3, 3)), "k1_color",
-                              d=()), colour_of(bag)),
-        "states no lens in /k1/color/camera_info.*or state the colour lens in column calibration",
-    ),
-    "depth without pose": (depth_elsewhere, "no static transform connects them"),
-    "no colour": (
-        lambda bag: bag.image("/k1/depth/image_raw", START_NS, "k1_depth", depth_image(0), "16UC1"),
-        "has no colour images of camera /k1",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("fault", FAULTY)
-def test_a_faulty_camera_is_named(tmp_path: Path, fault: str) -> None:
-    change, message = FAULTY[fault]
-    write(tmp_path, change)
-    layout = open_layout(row(tmp_path, calibration=rig_file(tmp_path, "k1")))
-    assert layout.names == ["k1"]
-    with pytest.raises(UserError, match=message):
-        layout.open("k1")
-
-
-def test_cameras_without_common_frame_are_named(tmp_path: Path) -> None:
-    with BagFile(tmp_path / "walk", "mcap") as bag:
-        write_camera(bag, "k1")
-        write_camera(bag, "k2", world=pose(0.1, 1.0, 0, 0))
-        bag.transforms(k2_color=("elsewhere", np.eye(4)))
-    with pytest.raises(UserError, match="connects frame 'k2_color' of camera k2"):
-        open_layout(row(tmp_path))
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("share", [0.02, 0.6, 0.97])
-def test_a_cut_file_is_named_with_its_repair(tmp_path: Path, form: Form, share: float) -> None:
-    path = place_of(tmp_path, form, "walk")
-    with BagFile(path, form) as bag:
-        write_camera(bag, images=20)
-    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    rig = rig_file(tmp_path, "walk", "k1")  # a bag that cannot be opened names the camera
-    with pytest.raises(UserError, match=r"cannot be read as a ROS bag \(.*repair it"):
-        layout = open_layout(row(tmp_path, calibration=rig))
-        for camera in layout.names:
-            with layout.open(camera) as recording:
-                list(recording.images())
-
-
-def test_other_files_are_named(tmp_path: Path) -> None:
-    (tmp_path / "k1.bag").write_bytes(b"")
-    (tmp_path / "k2.bag").write_bytes(b"no bag at all" * 10)
-    with pytest.raises(UserError, match=r"k1.bag: cannot be read .*seems to be empty"):
-        open_layout(row(tmp_path))
-    for path in tmp_path.iterdir():
-        path.unlink()
-    with BagFile(tmp_path / "k1.bag", "bag") as bag:
-        bag.transforms(k1_color=("map", np.eye(4)))
-    with pytest.raises(UserError, match=r"no bag has a topic of type sensor_msgs/.*/tf_static"):
-        open_layout(row(tmp_path))
-
-
-def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch) -> None:
-    with BagFile(tmp_path / "k1.bag", "bag") as bag:
-        write_camera(bag)
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(UserError, match=r"k1.bag: .*'intercap-core\[ros\]'"):
-        open_layout(row(tmp_path))
-    with pytest.raises(UserError, match=r"intercap-core\[ros\]"):
-        recognise_recordings(tmp_path)
 
 
 def test_static_transforms_are_followed_through_the_tree(tmp_path: Path) -> None:
