@@ -1,7 +1,8 @@
-"""`intercap calibrate` on public recordings, compared with the calibrations of their authors.
+"""Public recordings of real cameras: `intercap calibrate`, and the reader of RealSense's bags.
 
     python -m bench.real_rigs pose2sim CLONE
     python -m bench.real_rigs azure_kinect CLONE
+    python -m bench.real_rigs realsense CLONE
 
 CLONE is a git clone with its history. Files are extracted into ``results/real_rigs``.
 
@@ -10,6 +11,9 @@ CLONE is a git clone with its history. Files are extracted into ``results/real_r
   are those of release v0.4.0, lenses and reference poses those of Qualisys.
 - ``azure_kinect``: example of github.com/microsoft/Azure-Kinect-Sensor-SDK. 30 colour images of a
   ChArUco board; the first was taken together with an infrared image.
+- ``realsense``: bag of a D435 (2018) in the unit tests of github.com/realsenseai/librealsense, with
+  two depth images and a colour image. Images, times, lenses and the depth camera's pose are
+  compared with those that ``pyrealsense2`` (release 2.57 or earlier) reads.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import json
 import shutil
 import subprocess
 import tarfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +34,12 @@ from scipy.spatial.transform import Rotation
 
 from bench.command import exit_on_user_error
 from intercap_core.commands.calibrate import calibrate
+from intercap_core.entries import SequenceEntry
+from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.files import read_calibration
+from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.project import load_project
 
 SEQUENCE = "take"
@@ -79,6 +88,64 @@ def azure_kinect(clone: Path, folder: Path) -> None:
     pose = found.extrinsics.master_from_colour["infrared"]
     turn = np.degrees(Rotation.from_matrix(pose[:3, :3]).magnitude())
     print(f"infrared: {1e3 * np.round(pose[:3, 3], 5)} mm from the colour lens, {turn:.2f} degrees")
+
+
+def realsense(clone: Path, folder: Path) -> None:
+    """Read the bag, and print the largest differences from RealSense's own reader."""
+    import pyrealsense2 as rs
+
+    name = "unit-tests/resources/single_depth_color_640x480.bag"
+    _extract(clone, "HEAD", folder, name)
+    (folder / "recordings").mkdir()
+    bag = Path(shutil.move(folder / name, folder / "recordings" / "k1.bag"))
+    rig = folder / "rig.json"
+    write_rig_file(rig, Extrinsics("k1", {"k1": np.eye(4)}))
+    row = SequenceEntry(
+        sequence=SEQUENCE, subject="p", recordings=bag.parent, layout="ros", calibration=rig
+    )
+    with open_layout(row).open("k1") as recording:
+        camera, images, serial = recording.camera, list(recording.images()), recording.serial
+    device = rs.context().load_device(str(bag))
+    assert serial == device.get_info(rs.camera_info.serial_number)
+    device.as_playback().set_real_time(False)
+    frames, profiles = [], {}
+    for sensor in device.query_sensors():
+        (profile,) = sensor.get_stream_profiles()
+        profiles[profile.stream_type()] = profile.as_video_stream_profile()
+        queue = rs.frame_queue(16)
+        sensor.open(profile)
+        sensor.start(queue)
+        time.sleep(1)  # the library reads in a thread of its own
+        while frame := queue.poll_for_frame():
+            frames.append((profile.stream_type(), frame.timestamp, np.array(frame.get_data())))
+        sensor.stop()
+        sensor.close()
+    points = np.random.default_rng(0).uniform((-0.4, -0.3, 0.9), (0.4, 0.3, 3.0), (100, 3))
+    print(f"serial number {serial}, noise of depth {camera.depth_noise:.5f} z^2 m")
+    for kind, stream, lens in (
+        ("colour", rs.stream.color, camera.colour), ("depth", rs.stream.depth, camera.depth),
+    ):  # fmt: skip
+        own = [image for image in images if image.kind == kind]
+        theirs = [(at, data) for which, at, data in frames if which == stream]
+        assert lens is not None
+        true = profiles[stream].get_intrinsics()
+        pixels = [rs.rs2_project_point_to_pixel(true, point) for point in points.tolist()]
+        print(
+            f"{kind}: {len(own)} images, theirs {len(theirs)}; projection "
+            f"{np.abs(lens.project(points) - pixels).max():.2g} px"
+        )
+        for image, (at_ms, data) in zip(own, theirs, strict=False):
+            content = image.content
+            if isinstance(content, bytes):
+                shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+                content = shown[..., ::-1]
+            apart = np.abs(content.astype(float) - data)
+            print(f"  {image.time_us - 1e3 * at_ms:.1f} us, {apart.mean():.3g} in the mean")
+    pose = profiles[rs.stream.depth].get_extrinsics_to(profiles[rs.stream.color])
+    assert camera.colour_from_depth is not None
+    rotation = np.array(pose.rotation).reshape(3, 3).T  # by columns
+    apart = camera.colour_from_depth - rigid(rotation, np.array(pose.translation))
+    print(f"pose of the depth camera: {np.abs(apart).max():.2g}")
 
 
 def _extract(clone: Path, revision: str, folder: Path, path: str) -> None:
@@ -149,7 +216,7 @@ def _print_differences(found: Path, reference: Path) -> None:
     print(f"scale of the reference over ours: {scale:.3f}")
 
 
-DATA = {"pose2sim": pose2sim, "azure_kinect": azure_kinect}
+DATA = {"pose2sim": pose2sim, "azure_kinect": azure_kinect, "realsense": realsense}
 
 
 def main() -> None:
