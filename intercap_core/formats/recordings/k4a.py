@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +31,7 @@ from intercap_core.formats.calibration.k4a import (
     read_calibration,
 )
 from intercap_core.formats.calibration.opencv import check_rate
-from intercap_core.formats.recordings import encodings, video
+from intercap_core.formats.recordings import containers, encodings
 from intercap_core.formats.recordings.source import (
     Accelerometer,
     CameraRecording,
@@ -45,8 +44,10 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import quoted, read_bytes
 
 CALIBRATION_NAME = "calibration.json"
-IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
-# Largest delay of depth, or of a subordinate, that is accepted; the SDK allows one frame's period.
+IMU_SAMPLE = np.dtype(  # times in ns, m/s^2, rad/s
+    [("time", "<u8"), ("acceleration", "<f4", 3), ("rate_time", "<u8"), ("rate", "<f4", 3)]
+)
+# Largest delay of depth that is accepted; the SDK allows one frame's period.
 LONGEST_DELAY_US = 1_000_000
 
 Kind = Literal["colour", "depth", "imu"]
@@ -80,10 +81,6 @@ class KinectFileInfo:
     """Device time of the file's time 0, microseconds."""
     depth_delay_us: int
     """Device time of a depth image minus that of its colour image, microseconds."""
-    subordinate_delay_us: int
-    """Delay of this device against the master of the sync cable, microseconds."""
-    wired_sync_mode: str
-    """STANDALONE, MASTER or SUBORDINATE."""
     calibration: bytes
     """The device's calibration JSON."""
     truncated: bool
@@ -104,20 +101,20 @@ class KinectFile(ClosedOnExit):
         truncated = _is_truncated(self.path)
         try:
             # Headers of the tracks are complete, so that probing would only buffer packets.
-            self._container = video.open_container(self.path, probesize="32768")
+            self._container = containers.open_container(self.path, probesize="32768")
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{self.path}: cannot be opened as a recording ({error.strerror}); record again, "
                 "or copy the file again if the copy was cut off"
             ) from error
         try:
-            self._streams = self._find_tracks()
+            self._tracks = self._find_tracks()
             self.info = self._read_info(truncated)
         except BaseException:
             self._container.close()
             raise
         for stream in self._container.streams:
-            if stream.index not in self._streams:
+            if stream not in self._tracks.values():
                 stream.discard = Discard.all  # infrared is half of the bytes and is not used
 
     def close(self) -> None:
@@ -131,14 +128,17 @@ class KinectFile(ClosedOnExit):
         colour is yielded, because it counts in the numbers of the images. A file that was cut off
         ends early without an error.
         """
-        streams = [self._container.streams[index] for index in self._streams]
-        for packet in video.demux(self._container, streams, self._count_broken):
+        kinds = {stream.index: kind for kind, stream in self._tracks.items()}
+        streams = list(self._tracks.values())
+        for packet in containers.demux(self._container, streams, self._count_broken):
             if not packet.size or packet.pts is None or packet.time_base is None:
                 continue  # the end mark of a track
-            kind = self._streams[packet.stream_index]
+            kind = kinds[packet.stream_index]
             content = bytes(packet)
             time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
-            if self._is_complete(kind, content) and abs(time_us) <= video.LATEST_US:
+            width, height = self._depth_size
+            is_whole = kind != "depth" or 0 < len(content) == 2 * width * height
+            if is_whole and abs(time_us) <= containers.LATEST_US:
                 yield Packet(kind, time_us, content)
             else:
                 self._count_broken()
@@ -146,32 +146,27 @@ class KinectFile(ClosedOnExit):
     def _count_broken(self) -> None:
         self.broken_packets += 1
 
-    def _is_complete(self, kind: Kind, content: bytes) -> bool:
-        """Whether a packet holds colour, a depth image of the mode's size, or inertial samples."""
-        if kind != "depth":
-            return True
-        width, height = DEPTH_MODES[self.info.depth_mode].size if self.info.depth_mode else (0, 0)
-        return 0 < len(content) == 2 * width * height
+    @property
+    def _depth_size(self) -> tuple[int, int]:
+        """Width and height of depth images; 0 without depth."""
+        return DEPTH_MODES[self.info.depth_mode].size if self.info.depth_mode else (0, 0)
 
     def preview(self) -> RecordingPreview:
         """Inspect the colour track without reading the others."""
-        index = next(index for index, kind in self._streams.items() if kind == "colour")
-        seen = video.preview_video(self.path, index, self.info.fps)
+        seen = containers.preview_video(self.path, self._tracks["colour"].index, self.info.fps)
         if self.info.colour_format != "MJPG":
             return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
         return seen
 
     def depth_image(self, content: bytes) -> np.ndarray:
         """Convert a depth packet to (H, W) uint16, millimetres, 0 = invalid."""
-        if self.info.depth_mode is None:
-            raise ValueError(f"{self.path} has no depth")
-        width, height = DEPTH_MODES[self.info.depth_mode].size
+        width, height = self._depth_size
         return np.frombuffer(content, ">u2").reshape(height, width).astype(np.uint16)
 
     def camera(self, name: str, master_from_colour: np.ndarray | None = None) -> Camera:
-        """The device's lenses as a camera of a name and pose (4, 4); None = the identity.
+        """The device's lenses as a camera; raises UserError if the calibration is broken.
 
-        Raises UserError if the calibration is broken.
+        ``master_from_colour``: pose (4, 4), None = the identity.
         """
         return read_calibration(
             self.info.calibration,
@@ -188,23 +183,19 @@ class KinectFile(ClosedOnExit):
 
     # --- the head of the file ---------------------------------------------------------------
 
-    def _find_tracks(self) -> dict[int, Kind]:
-        """Kind of each track by its index: by its tag, else by its name."""
-        tracks: dict[int, Kind] = {}
+    def _find_tracks(self) -> dict[Kind, Any]:
+        """Streams by kind, found by the tag, else by the name."""
+        tracks: dict[Kind, Any] = {}
         candidates = [s for s in self._container.streams if s.type != "attachment"]
         for kind, name in TRACKS.items():
             tagged = [s for s in candidates if f"K4A_{name}_TRACK" in s.metadata]
             named = [s for s in candidates if s.metadata.get("title") == name]
             for stream in (tagged or named)[:1]:
-                tracks[stream.index] = kind
+                tracks[kind] = stream
         return tracks
 
-    def _stream(self, kind: Kind) -> Any:
-        index = next((i for i, k in self._streams.items() if k == kind), None)
-        return None if index is None else self._container.streams[index]
-
     def _read_info(self, truncated: bool) -> KinectFileInfo:
-        colour, depth = self._stream("colour"), self._stream("depth")
+        colour, depth = self._tracks.get("colour"), self._tracks.get("depth")
         if colour is None or colour.type != "video" or colour.codec_context is None:
             raise UserError(
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
@@ -218,10 +209,8 @@ class KinectFile(ClosedOnExit):
             depth_mode=self._depth_mode(depth),
             fps=fps,
             serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
-            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", video.LATEST_US),
+            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", containers.LATEST_US),
             depth_delay_us=self._microseconds("K4A_DEPTH_DELAY_NS", LONGEST_DELAY_US),
-            subordinate_delay_us=self._microseconds("K4A_SUBORDINATE_DELAY_NS", LONGEST_DELAY_US),
-            wired_sync_mode=self._container.metadata.get("K4A_WIRED_SYNC_MODE", "STANDALONE"),
             calibration=self._calibration(),
             truncated=truncated,
         )
@@ -283,9 +272,8 @@ class KinectFile(ClosedOnExit):
 
 def parse_imu_samples(content: bytes) -> np.ndarray:
     """Accelerations and angular rates (n, 6) of one packet, m/s^2 and rad/s."""
-    length = len(content) // IMU_SAMPLE.size * IMU_SAMPLE.size
-    samples = [(*s[1:4], *s[5:8]) for s in IMU_SAMPLE.iter_unpack(content[:length])]
-    return np.array(samples).reshape(-1, 6)
+    samples = np.frombuffer(content, IMU_SAMPLE, len(content) // IMU_SAMPLE.itemsize)
+    return np.hstack([samples["acceleration"], samples["rate"]]).astype(np.float64)
 
 
 def _is_truncated(path: Path) -> bool:
@@ -305,7 +293,7 @@ def _is_truncated(path: Path) -> bool:
             f"{path}: is not a Matroska file (it starts with {head[:4]!r}); give the .mkv that "
             "k4arecorder wrote"
         )
-    end = video.segment_end(head)
+    end = containers.segment_end(head)
     return end is None or size < end
 
 

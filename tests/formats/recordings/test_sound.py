@@ -12,6 +12,7 @@ from scipy import signal
 
 from intercap_core import artefacts
 from intercap_core.config import FramesSettings
+from intercap_core.formats.recordings.containers import read_sound
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.sound_delays import (
     SOUND_SIGMA_S,
@@ -19,7 +20,6 @@ from intercap_core.formats.recordings.sound_delays import (
     sound_starts,
 )
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
-from intercap_core.formats.recordings.video import read_sound
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames
 from tests.helpers.plain_capture import plain_entry, write_rig
