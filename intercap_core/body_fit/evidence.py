@@ -453,33 +453,14 @@ class Evidence:
 
     def _rows(self, by_view: ViewDistances, points: Tensor) -> CloudRows:
         """As :meth:`rows`, of other measurements."""
-        noise = self.cloud_noise[self.group]
         total = points.sum(1)
-        precise = points * share_of_precision(self.observations.rig, by_view.where, noise)
-        mean = (by_view.distance * precise).sum(1) / precise.sum(1).clamp_min(1e-6)
-        share = self.cloud_weight * SAMPLE_SHARE * precise.sum(1) / total.clamp_min(1e-6)
+        mean = (by_view.distance * points).sum(1) / total.clamp_min(1e-6)
+        noise = self.cloud_noise[self.group]
+        share = self.cloud_weight * SAMPLE_SHARE
         # with two points a sample has half its weight; tuned on the studio
         weight = share * total / (total + 2.0) / noise**2
         target = mean + (by_view.normal * by_view.where).sum(2)
         return CloudRows(target, by_view.normal, weight)
-
-
-def share_of_precision(rig: Rig, where: Tensor, noise: Tensor) -> Tensor:
-    """Variance of the covering over that of a camera's measurement, (N, C, S); 1 without stereo.
-
-    Neighbouring pixels of stereo share their error, so that more points do not reduce it.
-
-    Args:
-        rig: the cameras.
-        where: (N, S, 3) positions of samples of the skin, master frame, metres.
-        noise: (S,) standard deviation of each sample's covering, metres.
-    """
-    shares = torch.ones(len(where), len(rig), where.shape[1], dtype=where.dtype)
-    for c, camera in enumerate(rig):
-        if camera.depth is not None and camera.depth_noise:
-            sigma = torch.as_tensor(camera.stereo_sigma(where.double().numpy())).to(where)
-            shares[:, c] = noise**2 / (noise**2 + sigma**2)
-    return shares
 
 
 def _blocks(count: int) -> list[slice]:
