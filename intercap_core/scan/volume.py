@@ -24,7 +24,7 @@ from intercap_core.scan.surfaces import OBJECT, UNKNOWN
 BAND_M = 0.010
 # Scale of the weight of a distance. Near one side of a thin wall, measurements of that side count
 # more than those of the other side. Noise of depth and poses, metres.
-NOISE_M = 0.004
+NOISE_M = 0.003
 EMPTY_RATIO = 4.0  # a voxel is empty if its votes for empty space outnumber the others by this
 MIN_EMPTY = 3  # least votes of an empty voxel: single depth pixels are wrong
 
