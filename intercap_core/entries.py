@@ -74,9 +74,8 @@ class SequenceEntry(Model):
     start and, with their covariance, the prior of the stage scene. See docs/usage.md, Reuse over a
     day."""
     shape_from: SequenceName | None = None
-    """Sequence of the same subject in the same clothes, by the same keypoint detector. Its shape,
-    coverings and keypoint offsets are the start and, with their covariance, the prior of the stage
-    body_fit. See docs/usage.md, Reuse over a day."""
+    """Sequence of the same subject in the same clothes. Its shape and coverings are the start and,
+    with their covariance, the prior of the stage body_fit. See docs/usage.md, Reuse over a day."""
 
     @model_validator(mode="after")
     def _floor_needs_up(self) -> SequenceEntry:

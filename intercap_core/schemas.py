@@ -259,7 +259,7 @@ def _body(*, one_shape: bool) -> dict[str, Field]:
 
 BODY_FIT = Schema(
     name="body_fit",
-    version=5,
+    version=6,
     stage="body_fit",
     attributes={
         "sequence": "sequence name",
@@ -283,7 +283,7 @@ BODY_FIT = Schema(
         "keypoint_sigma": Field(("135",), "float32", "standard deviation of a keypoint at typical confidence, after the offsets", "m"),
         "keypoint_doubt": Field(("135",), "float32", "exponent by which keypoint_sigma grows as confidence decreases"),
         "covering": Field(("G",), "float32", "logarithm of the ratio of each covering's thickness (clothes, hair, shoes) to its prior mean"),
-        "shared_covariance": Field(("U", "U"), "float64", "covariance of the unknowns that all frames share: betas (unless each frame has its own), keypoint_offsets, covering"),
+        "shared_covariance": Field(("U", "U"), "float64", "covariance of the subject's unknowns, whatever keypoint_offsets are: betas (unless each frame has its own), covering"),
         "covering_noise": Field(("G",), "float32", "standard deviation of the point clouds about each covering", "m"),
         "cloud_offsets": Field(("T+1",), "int64", "frame t has the points cloud_offsets[t] to cloud_offsets[t + 1]"),
         "cloud_points": Field(("N", "3"), "float32", "depth points of the person, with the cameras of the scene", "m", "master", codec="none"),

@@ -117,7 +117,7 @@ class Evidence:
         observations: Observations,
         clouds: Sequence[PersonCloud | None],
         cloud_weight: float,
-        window: slice | None = None,
+        window: slice | np.ndarray | None = None,
     ) -> None:
         """Take the observations of a sequence, of the frames ``window`` only if one is given.
 

@@ -101,8 +101,8 @@ class Observations:
         """(C,) bool: the camera shows a keypoint of the body in a usable frame."""
         return np.asarray((self.confidence[self.usable, :, BODY] > 0).any((0, 2)))
 
-    def window(self, frames: slice) -> Observations:
-        """Return the observations of some frames."""
+    def window(self, frames: slice | np.ndarray) -> Observations:
+        """Return the observations of some frames, a slice or indices."""
         by_frame = ("keypoints", "confidence", "joints", "joint_views", "image_of", "times")
         return replace(self, **{name: getattr(self, name)[frames] for name in by_frame})
 

@@ -53,6 +53,12 @@ def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Ten
 # --- parameters ------------------------------------------------------------------------------
 
 
+def subject_places(size: int, num_betas: int) -> Tensor:
+    """Return the places (n,) of betas and coverings among ``size`` shared parameters."""
+    places = torch.arange(size)
+    return places[(places < num_betas) | (places >= num_betas + 3 * NUM_OFFSETS)]
+
+
 class Shared(NamedTuple):
     """The parameters that all frames share."""
 
@@ -79,7 +85,7 @@ class ParameterLayout:
     definition: Definition
     """Prior of the offsets."""
     earlier: SharedEstimate | None = None
-    """Estimate from another sequence, which replaces all priors of shared parameters."""
+    """Estimate from another sequence, which replaces the priors of betas and coverings."""
 
     @property
     def shape(self) -> slice:
@@ -167,15 +173,18 @@ class ParameterLayout:
             mean.append(like.new_zeros(len(COVERINGS)))
             sigma.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
             counts.append(like.new_full((len(COVERINGS),), 0.7))
-        per_frame = torch.cat(counts)
-        if self.earlier is None:
-            return torch.cat(mean), torch.diag(per_frame / torch.cat(sigma) ** 2), per_frame
-        # parameters that are fixed have the mean of the prior
-        first = 0 if self.one_shape else self.num_betas
-        at, share = slice(first, first + len(per_frame)), per_frame.sqrt()
-        known = torch.as_tensor(self.earlier.mean).to(like)[at]
-        precision = torch.as_tensor(self.earlier.precision).to(like)[at, at]
-        return known, share[:, None] * precision * share, per_frame
+        means, per_frame = torch.cat(mean), torch.cat(counts)
+        precision = torch.diag(torch.cat(sigma) ** -2)
+        if self.earlier is not None:
+            places = subject_places(len(means), self.one_shape * self.num_betas)
+            # parameters that are fixed have the mean of the prior
+            first = 0 if self.one_shape else self.num_betas
+            at = slice(first, first + len(places))
+            means[places] = torch.as_tensor(self.earlier.mean).to(like)[at]
+            known = torch.as_tensor(self.earlier.precision).to(like)[at, at]
+            precision[places[:, None], places] = known
+        share = per_frame.sqrt()
+        return means, share[:, None] * precision * share, per_frame
 
 
 # --- energy ----------------------------------------------------------------------------------
@@ -201,7 +210,7 @@ class BodyProblem(TermInputs):
     definition: Definition = field(default_factory=Definition.unknown)
     """Prior of the offsets."""
     earlier: SharedEstimate | None = None
-    """Estimate from another sequence, which replaces all priors of shared parameters."""
+    """Estimate from another sequence, which replaces the priors of betas and coverings."""
     terms: CompiledTerms | None = None
     """The terms, which cache what they need of the model; None = new ones."""
 

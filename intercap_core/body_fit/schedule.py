@@ -32,7 +32,7 @@ from intercap_core.body_fit.clouds import PersonCloud
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.observations import Observations
-from intercap_core.body_fit.problem import BodyProblem, columns_of
+from intercap_core.body_fit.problem import BodyProblem, columns_of, subject_places
 from intercap_core.body_fit.quality import PartEvidence, compare_parts
 from intercap_core.body_fit.recover import recover
 from intercap_core.body_fit.shared_estimate import SharedEstimate
@@ -115,11 +115,12 @@ class BodyFit:
     """(N,) bool: the energy of the frame has several minima (:func:`.recover.recover`)."""
 
     def shared_estimate(self, sequence: str, covariance: Tensor) -> SharedEstimate:
-        """Return the shared parameters, with their covariance (m, m) of :mod:`.uncertainty`."""
+        """Return shape and coverings; ``covariance`` (m, m) of :mod:`.uncertainty`."""
         offsets, u = self.settled.offsets, self.settled.covering
         num_betas = len(covariance) - offsets.numel() - len(u)  # 0 if each frame has its own
         betas = self.vectors[0, TRANSL.stop : TRANSL.stop + num_betas]
-        parts = (part.double().numpy() for part in (betas, offsets, u, covariance))
+        places = subject_places(len(covariance), num_betas)
+        parts = (part.double().numpy() for part in (betas, u, covariance[places][:, places]))
         return SharedEstimate(sequence, *parts)
 
 
@@ -133,9 +134,10 @@ class Fitter:
         settings: settings of the stage.
         pose_prior: learned prior of the body pose; None = the open prior.
         definition: prior of the keypoint offsets; None = unknown.
-        window: the frames to use; None = all. ``clouds`` are those of the window.
-        earlier: estimate of the shared parameters from another sequence of the subject: their start
-            and, in place of ``definition`` and the prior of the shape, their prior; None = none.
+        window: slice or indices of the frames to use; None = all. ``clouds`` are those of the
+            window.
+        earlier: shape and coverings of the subject in another sequence: their start and, in place
+            of the usual one, their prior; None = none.
     """
 
     def __init__(
@@ -146,7 +148,7 @@ class Fitter:
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
         definition: Definition | None = None,
-        window: slice | None = None,
+        window: slice | np.ndarray | None = None,
         earlier: SharedEstimate | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
@@ -161,14 +163,12 @@ class Fitter:
         """Fit all frames by the stages of the module."""
         evidence, hands, face = self.evidence, self.settings.hands, self.settings.face
         base = self.model.zeros(len(self.frames)).vector()
-        offsets, u = self.definition.offsets, np.zeros(len(COVERINGS))
-        if self.earlier:
-            offsets, u = self.earlier.offsets, self.earlier.covering
+        u = self.earlier.covering if self.earlier else np.zeros(len(COVERINGS))
         problem = self._problem(
             base=base,
             columns=columns_of(self.model, hands=False, face=False, betas=not self.one_shape),
             one_shape=self.one_shape,
-            offsets=torch.as_tensor(offsets).to(base),
+            offsets=torch.as_tensor(self.definition.offsets).to(base),
             u=torch.as_tensor(u).to(base),
             definition=self.definition,
             earlier=self.earlier,

@@ -1,9 +1,9 @@
-"""The parameters that all frames share, with their covariance: the result of one sequence, and the
-prior of another sequence of the same subject (column ``shape_from``).
+"""Shape and coverings of a subject with their covariance: the result of one sequence, and the prior
+of another sequence of the same subject (column ``shape_from``).
 
 Errors of shared parameters are the same in every frame, so the covariance counts a recording as
-a few independent frames (:meth:`.problem.ParameterLayout.prior`). The whole matrix is passed on:
-an error of the shape is correlated with those of keypoint offsets and of clothing.
+a few independent frames (:meth:`.problem.ParameterLayout.prior`). Keypoint offsets belong to the
+detector and not to the subject, so they are marginalised out.
 """
 
 from __future__ import annotations
@@ -28,14 +28,12 @@ OTHER_PERSON = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SharedEstimate:
-    """Gaussian of the m = S + 75 + G shared parameters, in the order of :mod:`.problem`."""
+    """Gaussian of the m = S + G parameters of a subject: betas, then coverings."""
 
     sequence: str
     """Sequence that it was estimated from."""
     betas: np.ndarray
     """(S,) in units of the subject's prior; S = 0 if each frame has its own."""
-    offsets: np.ndarray
-    """(25, 3) keypoint offsets, metres."""
     covering: np.ndarray
     """(G,) logarithms of the thickness of the coverings over the usual one."""
     covariance: np.ndarray
@@ -59,10 +57,10 @@ class SharedEstimate:
         with artefacts.read(path, BODY_FIT) as fit:
             other, covariance = str(fit.attributes["sequence"]), fit["shared_covariance"]
             betas = fit["betas"][~fit["failed"]].astype(float)
-            offsets, u = fit["keypoint_offsets"].astype(float), fit["covering"].astype(float)
+            u = fit["covering"].astype(float)
             attributes = fit.attributes
         count = len(shapes.mean)
-        shared = len(covariance) == betas.shape[1] + offsets.size + len(u)
+        shared = len(covariance) == betas.shape[1] + len(u)
         for what, actual, expected in (
             ("subject", attributes["subject"], subject.subject),
             ("body file", attributes["body_model"], body_model),
@@ -76,8 +74,8 @@ class SharedEstimate:
                     f"{other!r}, name another sequence in the row of {sequence!r}, or clear it"
                 )
         z = np.linalg.solve(shapes.root, betas.mean(0) - shapes.mean)
-        to_z = block_diag(np.linalg.inv(shapes.root), np.eye(offsets.size + len(u)))
-        return cls(other, z, offsets, u, to_z @ covariance @ to_z.T)
+        to_z = block_diag(np.linalg.inv(shapes.root), np.eye(len(u)))
+        return cls(other, z, u, to_z @ covariance @ to_z.T)
 
     def of_file(self, shapes: ShapePrior) -> np.ndarray:
         """Return the covariance (m, m) with the betas of the body file, as an artefact holds it."""
@@ -87,8 +85,8 @@ class SharedEstimate:
 
     @property
     def mean(self) -> np.ndarray:
-        """(m,) all parameters: betas, offsets in metres, coverings."""
-        return np.concatenate([self.betas, self.offsets.ravel(), self.covering])
+        """(m,) betas, then coverings."""
+        return np.concatenate([self.betas, self.covering])
 
     @cached_property
     def precision(self) -> np.ndarray:

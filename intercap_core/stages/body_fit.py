@@ -34,6 +34,9 @@ from intercap_core.schemas import BAD_BODY_M, BODY_FIT, BODY_PARTS
 
 # Median trunk keypoint error from which the fit is not of the subject's body; tuned on the studio.
 WRONG_TRUNK_M = 0.06
+# Frames of the fit that checks the shape of another sequence. Its covariance does not depend on
+# their number, since a recording counts as 3 independent frames (:mod:`.problem`).
+CHECKED_FRAMES = 16
 
 
 def run(
@@ -54,9 +57,9 @@ def run(
     ``failed`` and ``bridged``: their bodies are interpolated from neighbouring frames.
 
     Args:
-        shape_from: body_fit artefact of another sequence of the subject, whose shape, coverings and
-            keypoint offsets are start and prior of this one's. They are not used if this recording
-            contradicts the shape.
+        shape_from: body_fit artefact of another sequence of the subject, whose shape and coverings
+            are start and prior of this one's. They are not used if this recording contradicts the
+            shape.
 
     Raises UserError if no frame can be fitted, the body file cannot be used, or the artefacts do
     not belong together.
@@ -84,21 +87,25 @@ def run(
         clouds.append(cloud)
     definition = Definition.read(settings.keypoint_definition)
 
-    def fit_with(earlier: SharedEstimate | None) -> tuple[BodyFit, Covariances, SharedEstimate]:
-        fit = Fitter(model, seen, clouds, settings, pose_prior, definition, earlier=earlier).run()
+    def fit_with(
+        earlier: SharedEstimate | None, some: np.ndarray | None = None
+    ) -> tuple[BodyFit, Covariances, SharedEstimate]:
+        own = clouds if some is None else clouds.select(some.tolist())
+        fit = Fitter(model, seen, own, settings, pose_prior, definition, some, earlier).run()
         covariances = fit_covariances(model, fit)
         return fit, covariances, fit.shared_estimate(seen.sequence, covariances.shared)
 
-    fit, covariances, shared = fit_with(None)
     shape_note = {}
-    if earlier is not None and earlier.contradicts(shared):
-        shape_note["shape_note"] = (
-            f"the images contradict the shape of sequence {earlier.sequence} (shape_from), which "
-            "was not used; check that both show the same person and have keypoints of the same "
-            "detector"
-        )
-    elif earlier is not None:
-        fit, covariances, shared = fit_with(earlier)
+    if earlier is not None:
+        usable = np.flatnonzero(seen.usable)
+        rows = np.linspace(0, len(usable) - 1, min(CHECKED_FRAMES, len(usable))).astype(int)
+        if earlier.contradicts(fit_with(None, usable[rows])[2]):
+            shape_note["shape_note"] = (
+                f"the images contradict the shape of sequence {earlier.sequence} (shape_from), "
+                "which was not used; check that both show the same person"
+            )
+            earlier = None
+    fit, covariances, shared = fit_with(earlier)
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body

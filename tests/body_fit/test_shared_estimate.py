@@ -14,16 +14,16 @@ from intercap_core.body_fit.shared_estimate import SharedEstimate
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 BETAS, OWN, FRAMES = 10, 3, 4
-SIZE = BETAS + 75 + 9
+SIZE = BETAS + 9  # of an estimate
+SHARED = BETAS + 75 + 9
+SUBJECT = np.r_[:BETAS, BETAS + 75 : SHARED]
 
 
 def _estimate(seed: int = 0, scale: float = 1.0) -> SharedEstimate:
     """A random Gaussian whose parameters are all correlated."""
     random = np.random.default_rng(seed)
     mean, root = scale * random.normal(size=SIZE), 0.1 * random.normal(size=(SIZE, 2 * SIZE))
-    return SharedEstimate(
-        "a", mean[:BETAS], mean[BETAS:-9].reshape(25, 3), mean[-9:], scale**2 * root @ root.T
-    )
+    return SharedEstimate("a", mean[:BETAS], mean[BETAS:], scale**2 * root @ root.T)
 
 
 def _layout(earlier: SharedEstimate | None, *, fit_shared: bool = True) -> ParameterLayout:
@@ -41,7 +41,7 @@ def _equations(layout: ParameterLayout, shared: torch.Tensor) -> NormalEquations
 @pytest.mark.parametrize("fit_shared", [True, False])
 def test_gradient_and_hessian_of_the_prior_are_its_differences(fit_shared: bool) -> None:
     layout = _layout(_estimate(), fit_shared=fit_shared)
-    size = SIZE if fit_shared else BETAS
+    size = SHARED if fit_shared else BETAS
     at = torch.as_tensor(np.random.default_rng(1).normal(size=size))
     found, step = _equations(layout, at), 1e-4
     torch.testing.assert_close(found.cost, layout.prior_cost(at).expand(FRAMES))
@@ -57,16 +57,16 @@ def test_gradient_and_hessian_of_the_prior_are_its_differences(fit_shared: bool)
 
 
 def test_one_over_the_count_frames_add_up_to_the_inverse_covariance() -> None:
-    """Also for the priors without another sequence, whose parameters are independent."""
+    """Without another sequence, and those of offsets also with one, they are independent."""
     known = _estimate()
     like = torch.zeros(1, dtype=torch.float64)
     for layout in (_layout(known), _layout(None)):
         _, precision, counts = layout.prior(like)
         whole = precision / (counts[:, None] * counts).sqrt()
-        expected = np.linalg.inv(known.covariance)
-        if layout.earlier is None:
-            sigma = np.r_[np.ones(BETAS), np.full(75, 0.010), [0.1, 0.6, *[0.5] * 2, 0.7, 0.5, 0.6]]
-            expected = np.diag(np.r_[sigma, 1.0, 1.0] ** -2.0)
+        sigma = np.r_[np.ones(BETAS), np.full(75, 0.010), [0.1, 0.6, *[0.5] * 2, 0.7, 0.5, 0.6]]
+        expected = np.diag(np.r_[sigma, 1.0, 1.0] ** -2.0)
+        if layout.earlier is not None:
+            expected[np.ix_(SUBJECT, SUBJECT)] = np.linalg.inv(known.covariance)
         np.testing.assert_allclose(whole, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
 
 
