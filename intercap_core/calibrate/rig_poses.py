@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_INDEX
-from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust
+from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust, jackknife_covariance
 from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
@@ -60,6 +60,9 @@ MAX_GRAVITY_DEG = 5.0  # between gravity sensors; one of a Kinect is within a de
 # at most 11 mm + 0.1 % of the depth (data sheet), taken as two standard deviations; mean of six
 # cameras at 2.5 m.
 DEPTH_SCALE_SIGMA = 0.0015
+# Groups of a jackknife; length of blocks of time, seconds: errors of detectors last for half a
+# second (KEYPOINT_ERROR_TIME_S), those of occluded joints longer.
+JACKKNIFE, BLOCK_S = 8, (0.5, 1.0)
 
 
 def find_poses(
@@ -244,13 +247,12 @@ def _place(
     terms = _terms(rig, views, everyone, board)
     poses, covariance, _ = adjust(_in_use(terms), rig.master_from_colour, everyone[1:])
     rig = rig.moved(poses)
-    factor = _half_factor(rig, views, board)
     joints, boards = terms
     walk = reference_points(rig, views, everyone, None)[:, HIPS].mean(1)
     nothing = np.full(len(rig), np.nan)
     found = FoundRig(
         rig=rig,
-        covariance=factor * covariance,
+        covariance=covariance + _shared_errors(rig, views, board),
         joint_error_px=joints.errors_px(poses) if len(joints) else nothing,
         corner_error_px=boards.errors_px(poses) if boards is not None and len(boards) else nothing,
         joints=count_shared_joints(views),
@@ -263,34 +265,32 @@ def _place(
     return found, views, [boards] if boards is not None and len(boards) else []
 
 
-def _half_factor(rig: Rig, views: Views, board: Board | None) -> float:
-    """Factor, 1 or more, on the covariance by which poses from two halves of the views differ.
+def _shared_errors(rig: Rig, views: Views, board: Board | None) -> np.ndarray:
+    """Covariance (C, 6, C, 6) of errors that many images share and that residuals do not show.
 
-    Errors that many images share do not show in the residuals. Those that last for seconds show
-    between the halves of a recording, those that a joint has all the time between halves of the
-    joints. The larger factor counts. The scale is left out: joints without depth do not determine
-    it.
+    It is the sum of two jackknives, with an eighth left out at a time: of the joints, since each
+    joint errs alike in all images of a camera, and of the time, since joints and corners of one
+    image err together.
     """
-    poses, others = rig.master_from_colour, list(range(1, len(rig)))
-    recordings = range(views.recording.max() + 1)
-    middle = np.array([np.median(views.times[views.recording == k]) for k in recordings])
-    early = (views.times < middle[views.recording])[:, None, None]
-    point = np.arange(views.pixels.shape[2])
-    factors = [1.0]
-    for half in (early, np.where(point < NUM_JOINTS, point % 2 == 0, early)):
-        parts = [
-            _in_use(_terms(rig, views.only(kept), [0, *others], board)) for kept in (half, ~half)
-        ]
-        if all(parts):
-            found, covariances, _ = zip(
-                *(adjust(terms, poses, others, steps=10) for terms in parts), strict=True
-            )
-            first, second = (at[:, :3, 3] for at in found)
-            apart = first - second * (first * second).sum() / (second**2).sum()
-            expected = add_scale_sigma(np.sum(covariances, 0), poses, 0.0, replaced=True)
-            variance = np.array([np.trace(expected[c, 3:, c, 3:]) for c in others])
-            factors.append(float(np.mean((apart[others] ** 2).sum(1) / variance)))
-    return max(factors)
+    poses, everyone = rig.master_from_colour, list(range(len(rig)))
+    joints = reference_points(rig, views, everyone, None)[:, JOINTS]
+    point, count = np.arange(views.pixels.shape[2]), len(views.times)
+    gap = float(np.median(np.diff(views.times))) if count > 1 else BLOCK_S[0]
+    block_s = np.clip(count * gap / JACKKNIFE, *BLOCK_S)
+    block = (np.arange(count) * gap / block_s).astype(int)
+    of_point = np.where(point < NUM_JOINTS, point % JACKKNIFE, -1)  # corners are never left out
+    total = np.zeros((6 * len(rig), 6 * len(rig)))
+    for group in (of_point, (block % JACKKNIFE)[:, None, None]):
+        found = []
+        for left_out in np.unique(group[group >= 0]):
+            kept = views.only(group != left_out)
+            boards = None
+            if board is not None:
+                boards = BoardTerm(rig, kept, board, board_poses(rig, kept, everyone, board))
+            if terms := _in_use((JointTerm(rig, kept, joints), boards)):
+                found.append(adjust(terms, poses, everyone[1:], steps=2)[0])
+        total += jackknife_covariance(np.array(found), poses)
+    return total.reshape(len(rig), 6, len(rig), 6)
 
 
 def _describe_unplaced(rig: Rig, placed: Sequence[int], left: Sequence[Placement]) -> str:
@@ -369,7 +369,7 @@ def _refine(
             return
         found.rig = found.rig.moved(refined.poses)
         poses, sigma = found.rig.master_from_colour, DEPTH_SCALE_SIGMA
-        found.covariance = add_scale_sigma(refined.covariance, poses, sigma, replaced=False)
+        found.covariance = add_scale_sigma(refined.covariance, poses, sigma)
         before, after = refined.surfaces_mm
         log.info("surfaces: %.1f to %.1f mm apart", before, after)
 

@@ -15,6 +15,7 @@ from intercap_core.calibrate.placement import board_pose, reference_points
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.boards import Board
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import apply_step
 
 _SEGMENTS = [
     (f"{side}_{a}", f"{side}_{b}")
@@ -28,6 +29,7 @@ UPRIGHT, BUILD_SIGMA = 0.97, 0.025
 HEIGHT_M, HEIGHT_SIGMA_M = 1.70, 0.095  # of adults of both sexes (NCD-RisC, eLife 2016), if unknown
 STATED_SIGMA_M = 0.02  # of a stated height, as in the table of subjects
 
+SETS = 60  # of frames in which derivatives of the height are taken
 MAX_BOARD_FACTOR = 0.05  # by which a board's size may contradict the depth
 
 
@@ -83,12 +85,20 @@ def rescale(
             if name not in names:
                 known = ", ".join(names)
                 raise UserError(f"--distance names camera {name!r}; expected one of {known}")
-        a, b = (rig.master_from_colour[names.index(name), :3, 3] for name in distance[:2])
-        scale, sigma = distance[2] / float(np.linalg.norm(a - b)), 0.005 / distance[2]  # 5 mm
+        a, b = (names.index(name) for name in distance[:2])
+
+        def length(poses: np.ndarray) -> float:
+            return float(np.linalg.norm(poses[a, :3, 3] - poses[b, :3, 3]))
+
+        scale, sigma = distance[2] / length(rig.master_from_colour), 0.005 / distance[2]  # 5 mm
         found.scale = f"the stated distance between {distance[0]} and {distance[1]}"
     else:
-        joints = reference_points(rig, views, list(range(len(rig))), None)[:, JOINTS]
-        scale, sigma = scale_by_height(joints, height_m)
+        some = views.subset(np.unique(np.linspace(0, len(views.times) - 1, SETS).astype(int)))
+
+        def length(poses: np.ndarray) -> float:
+            return 1 / _scale_by_height(rig.moved(poses), some, height_m)[0]
+
+        scale, sigma = _scale_by_height(rig, views, height_m)
         if not np.isfinite(scale):
             raise UserError(
                 "nothing determines the scale: the person's limbs are not seen; state the distance "
@@ -107,23 +117,43 @@ def rescale(
     covariance[:, 3:] *= scale
     covariance[:, :, :, 3:] *= scale
     found.rig, found.walk = rig.moved(poses), scale * found.walk
-    found.covariance = add_scale_sigma(covariance, poses, sigma, replaced=True)
+    found.covariance = add_scale_sigma(fix_scale(covariance, poses, length), poses, sigma)
 
 
-def add_scale_sigma(
-    covariance: np.ndarray, poses: np.ndarray, sigma: float, *, replaced: bool
+def _scale_by_height(rig: Rig, views: Views, height_m: float | None) -> tuple[float, float]:
+    joints = reference_points(rig, views, list(range(len(rig))), None)[:, JOINTS]
+    return scale_by_height(joints, height_m)
+
+
+def fix_scale(
+    covariance: np.ndarray, poses: np.ndarray, length: Callable[[np.ndarray], float]
 ) -> np.ndarray:
-    """Covariance (C, 6, C, 6) with a relative standard deviation of the scale.
+    """Covariance (C, 6, C, 6) of poses that are scaled such that ``length`` has a given value.
 
-    ``replaced``: the scale's own variance is first removed, as if it were known exactly.
+    An error x of the poses that changes the length by g' x is followed by a change of the scale,
+    by -g' x over the length: x - w g' x / (g' w), w the derivative of the poses by the scale's
+    logarithm.
     """
+    way, gradient = _by_scale(poses), np.zeros(6 * len(poses))
+    for at in range(6, len(gradient)):  # the master does not move
+        step = np.zeros((len(poses), 6))
+        step.flat[at] = 1e-3
+        gradient[at] = (length(apply_step(poses, step)) - length(apply_step(poses, -step))) / 2e-3
+    fixed = np.eye(len(way)) - np.outer(way, gradient) / (gradient @ way)
+    return (fixed @ covariance.reshape(len(way), -1) @ fixed.T).reshape(covariance.shape)
+
+
+def add_scale_sigma(covariance: np.ndarray, poses: np.ndarray, sigma: float) -> np.ndarray:
+    """Covariance (C, 6, C, 6) with an additional relative standard deviation of the scale."""
+    way = _by_scale(poses)
+    return covariance + sigma**2 * np.outer(way, way).reshape(covariance.shape)
+
+
+def _by_scale(poses: np.ndarray) -> np.ndarray:
+    """Steps (6 C,) of the poses by the logarithm of the scale."""
     steps = np.zeros((len(poses), 6))
     steps[:, 3:] = poses[:, :3, 3]
-    way, flat = steps.ravel(), covariance.reshape(6 * len(poses), -1)
-    if replaced:
-        coupled = flat @ way
-        flat = flat - np.outer(coupled, coupled) / max(float(way @ coupled), 1e-12)
-    return (flat + sigma**2 * np.outer(way, way)).reshape(covariance.shape)
+    return steps.ravel()
 
 
 def check_board_size(rig: Rig, views: Views, board: Board) -> None:

@@ -17,11 +17,13 @@ from intercap_core.calibrate.adjust import (
     BoardTerm,
     JointTerm,
     adjust,
+    jackknife_covariance,
 )
 from intercap_core.calibrate.evidence import CORNERS, NUM_JOINTS
+from intercap_core.calibrate.scale import fix_scale
 from intercap_core.formats.calibration.boards import parse_board
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.camera.transforms import apply, apply_step, invert
+from intercap_core.geometry.camera.transforms import apply, apply_step, invert, step_between
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.scene.constraints import KEYPOINT_ERROR_TIME_S, ROBUST_SIGMA
 from tests.calibrate.synthetic_views import FPS, board_poses_around, views_of_walker, with_board
@@ -179,3 +181,30 @@ def test_errors_of_poses_are_as_large_as_their_covariance_says() -> None:
         off = (poses - rig.master_from_colour)[1:, :3, 3].ravel()
         ratios.append(np.mean(off**2 / np.diagonal(covariance[1:, 3:, 1:, 3:].reshape(6, 6))))
     assert 0.4 < np.mean(ratios) < 2.0
+
+
+def test_jackknife_of_a_mean_is_the_variance_of_groups_over_their_number() -> None:
+    """A pose that is the mean of 8 steps; 2.365 is Student's 97.5 % quantile of 7 degrees."""
+    steps = 1e-3 * np.random.default_rng(0).normal(size=(8, 2, 6))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    without = (steps.sum(0) - steps) / 7
+    found = jackknife_covariance(apply_step(poses, without), poses)
+    expected = (2.365 / 1.960) ** 2 * np.cov(steps.reshape(8, 12), rowvar=False) / 8
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-12)
+    assert not jackknife_covariance(apply_step(poses, without[:1]), poses).any()
+
+
+def test_poses_of_a_stated_distance_err_as_their_scaled_steps_do() -> None:
+    rig, _, _ = views_of_walker(4, 2)
+    poses = rig.master_from_colour
+    step = 1e-5 * np.random.default_rng(0).normal(size=(4, 6))
+    step[0] = 0
+
+    def length(at: np.ndarray) -> float:
+        return float(np.linalg.norm(at[1, :3, 3] - at[3, :3, 3]))
+
+    scaled = apply_step(poses, step)
+    scaled[:, :3, 3] *= length(poses) / length(scaled)
+    expected = step_between(poses, scaled).ravel()
+    found = fix_scale(np.outer(step, step).reshape(4, 6, 4, 6), poses, length)
+    np.testing.assert_allclose(found.reshape(24, 24), np.outer(expected, expected), atol=1e-13)
