@@ -174,17 +174,16 @@ class ParameterLayout:
             sigma.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
             counts.append(like.new_full((len(COVERINGS),), 0.7))
         means, per_frame = torch.cat(mean), torch.cat(counts)
-        precision = torch.diag(torch.cat(sigma) ** -2)
+        precision = torch.diag(per_frame / torch.cat(sigma) ** 2)
         if self.earlier is not None:
             places = subject_places(len(means), self.one_shape * self.num_betas)
             # parameters that are fixed have the mean of the prior
             first = 0 if self.one_shape else self.num_betas
-            at = slice(first, first + len(places))
+            at, share = slice(first, first + len(places)), per_frame[places].sqrt()
             means[places] = torch.as_tensor(self.earlier.mean).to(like)[at]
             known = torch.as_tensor(self.earlier.precision).to(like)[at, at]
-            precision[places[:, None], places] = known
-        share = per_frame.sqrt()
-        return means, share[:, None] * precision * share, per_frame
+            precision[places[:, None], places] = share[:, None] * known * share
+        return means, precision, per_frame
 
 
 # --- energy ----------------------------------------------------------------------------------
