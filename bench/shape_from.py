@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.command import exit_on_user_error
+from bench.evaluate.part import number, truth_of
 from intercap_core import artefacts
 from intercap_core.body.loading import load_body_file
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.evaluate.part import number, truth_of
 from intercap_core.evaluation import body
 from intercap_core.evaluation.tracks import read_body
 from intercap_core.evaluation.truth import Truth
