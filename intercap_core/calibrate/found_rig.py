@@ -11,9 +11,10 @@ from intercap_core.calibrate.adjust import JointTerm
 from intercap_core.calibrate.evidence import CORNERS, JOINTS, Views
 from intercap_core.calibrate.lenses import LensEstimate
 from intercap_core.geometry.camera.rig import Rig, ring_centre
-from intercap_core.scene.camera_verdicts import weakest_motion
+from intercap_core.scene.camera_verdicts import covariance_at
 
-WEAK_M = 0.03  # standard deviation at the rig's centre from which a camera is called weak
+WEAK_M = 0.03  # estimated error from which a camera is called weak
+CUBE_M = 2.0  # side of the cube whose points are displaced, as in the evaluation
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +58,16 @@ class FoundRig:
     """Estimated or refined lenses by camera."""
 
     def sigma_m(self, camera: int) -> float:
-        """Standard deviation of the rig's centre as the camera sees it, in its worst direction."""
+        """Root mean square displacement of a 2 m cube at the rig's centre as the camera sees it.
+
+        Of a point x of the cube at c, the displacement by an error (w, v) of the pose with centre t
+        is w x (x - t) + v. Its mean square is that at c plus |w|^2 times a sixth of the squared
+        side.
+        """
         pose = self.rig.master_from_colour[camera]
         block = self.covariance[camera, :, camera]
-        return weakest_motion(block, pose, ring_centre(self.rig))[0]
+        variance = np.trace(covariance_at(block, pose, ring_centre(self.rig)))
+        return float(np.sqrt(variance + CUBE_M**2 / 6 * np.trace(block[:3, :3])))
 
 
 def count_shared_joints(views: Views) -> np.ndarray:

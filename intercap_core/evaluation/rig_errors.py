@@ -95,7 +95,7 @@ class RigErrors:
     """(C - 1,) displacement over a 2 m cube of the cameras but the master, metres; empty if the
     poses were not found."""
     sigma: np.ndarray
-    """(C - 1,) estimated errors, metres: worst direction, at the rig's centre."""
+    """(C - 1,) estimated errors, metres: the same displacement."""
     problem: str = ""
     """Why the poses were not found."""
     chain: ChainErrors | None = None

@@ -167,6 +167,16 @@ def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEsti
     return mixed
 
 
+def covariance_at(covariance: np.ndarray, pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Covariance (3, 3) of a point as one camera sees it, square metres.
+
+    Arguments as in :func:`weakest_motion`; ``point`` (3,) in the master frame, metres.
+    """
+    across = np.cross(np.eye(3), point - pose[:3, 3])  # row i: the shift by a turn about axis i
+    by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
+    return np.asarray(by_pose @ covariance[:6, :6] @ by_pose.T)
+
+
 def weakest_motion(
     covariance: np.ndarray, pose: np.ndarray, centre: np.ndarray
 ) -> tuple[float, np.ndarray]:
@@ -183,9 +193,7 @@ def weakest_motion(
     Returns:
         Standard deviation, metres, and unit direction (3,), master frame.
     """
-    across = np.cross(np.eye(3), centre - pose[:3, 3])  # row i: the shift by a turn about axis i
-    by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
-    values, vectors = np.linalg.eigh(by_pose @ covariance[:6, :6] @ by_pose.T)
+    values, vectors = np.linalg.eigh(covariance_at(covariance, pose, centre))
     return float(np.sqrt(max(values[-1], 0.0))), vectors[:, -1]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ from intercap_core.calibrate.adjust import (
     jackknife_covariance,
 )
 from intercap_core.calibrate.evidence import CORNERS, NUM_JOINTS
+from intercap_core.calibrate.found_rig import FoundRig
 from intercap_core.calibrate.scale import fix_scale
 from intercap_core.formats.calibration.boards import parse_board
-from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply, apply_step, invert, step_between
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.scene.constraints import KEYPOINT_ERROR_TIME_S, ROBUST_SIGMA
@@ -208,3 +210,19 @@ def test_poses_of_a_stated_distance_err_as_their_scaled_steps_do() -> None:
     expected = step_between(poses, scaled).ravel()
     found = fix_scale(np.outer(step, step).reshape(4, 6, 4, 6), poses, length)
     np.testing.assert_allclose(found.reshape(24, 24), np.outer(expected, expected), atol=1e-13)
+
+
+def test_the_estimated_error_is_the_mean_displacement_of_sampled_poses() -> None:
+    rig, _, _ = views_of_walker(2, 2)
+    poses, random = rig.master_from_colour, np.random.default_rng(0)
+    root = 1e-3 * random.normal(size=(6, 6))
+    covariance = np.zeros((2, 6, 2, 6))
+    covariance[1, :, 1] = root @ root.T
+    nothing = np.full(2, np.nan)
+    found = FoundRig(rig, covariance, *[nothing] * 5, [], np.zeros((0, 3)), "")
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3)  # their covariance
+    cube = ring_centre(rig) + corners
+    steps = random.normal(size=(4000, 6)) @ root.T
+    moved = apply_step(np.broadcast_to(poses[1], (4000, 4, 4)), steps) @ invert(poses[1])
+    square = [((apply(pose, cube) - cube) ** 2).sum(1).mean() for pose in moved]
+    assert found.sigma_m(1) == pytest.approx(np.sqrt(np.mean(square)), rel=0.05)
