@@ -450,6 +450,7 @@ METRICS = Schema(
     },
     optional_attributes={
         "made_by": "name of the other program that made the measured results; absent for this program's",
+        "physics_note": "what the physics of the object does not judge, and why; empty = all is judged; absent without an object",
     },
     fields={
         "body_to_object": Field(("T", "V"), "float32", "signed distance of each body vertex to the object's surface, negative inside, capped at 0.10, inside at -0.25", "m", optional=True),
@@ -494,6 +495,14 @@ METRICS = Schema(
         "verdict/overlap_held_out": Field(("T", "C"), "float64", "the same in the held-out camera, with an object fitted without it", optional=True),
         "verdict/object_depth_m": Field(("T", "C"), "float64", "median residual of the object's depth", "m", optional=True),
         "verdict/object_depth_m_held_out": Field(("T", "C"), "float64", "the same in the held-out camera, with an object fitted without it", "m", optional=True),
+        "physics/carrier": Field(("T",), "str", "what carries the object: 'body', 'floor', 'furniture', 'free fall', 'unsupported', 'held by something unknown' or 'not determined'", optional=True),
+        "physics/support_acceleration": Field(("T",), "float32", "upward acceleration that a support gives the object's centre of mass; 9.81 at rest, 0 in free fall; NaN = unknown", "m/s^2", optional=True),
+        "physics/support_acceleration_sigma": Field(("T",), "float32", "its standard deviation", "m/s^2", optional=True),
+        "physics/penetration": Field(("T",), "float32", "depth of the object's collision shape below the floor, or at rest below its support; NaN = no floor", "m", optional=True),
+        "physics/release_frame": Field(("Nr",), "int32", "frames in which the resting object was released and simulated", optional=True),
+        "physics/release_displacement": Field(("Nr",), "float64", "displacement of its centre of mass after 35 frames", "m", optional=True),
+        "physics/release_support": Field(("Nr",), "str", "surface on which it was released: 'floor' or 'furniture'", optional=True),
+        "physics/bad": Field(("T",), "bool", "physics contradicts the object's pose: it is unsupported, or does not stay when released", optional=True),
         **_PER_STAGE_TRUTH,
         "truth/sweep": Field(("W",), "float64", "distance thresholds of vertex_contact_counts", "m", optional=True),
         "truth/contact_region": Field(("T", "12"), "bool", "true contact by region", optional=True),

@@ -14,11 +14,13 @@ from bench.evaluate.part import (
     Measured,
     config_files,
     number,
+    truth_of,
     with_spread,
 )
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.figures import displacements, physics_figures
 from intercap_core.evaluation.through_wall import count_behind_wall
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
@@ -67,6 +69,8 @@ class MeasuredSequence:
     """Whether the sequence has annotations."""
     behind_wall: np.ndarray
     """(2,) touched vertices of a thin-walled object, and those of them behind a wall."""
+    displacement: dict[str, np.ndarray]
+    """Displacements of the released object at the true, joint and sequential poses, metres."""
 
 
 Sequences = Measured[MeasuredSequence]
@@ -77,7 +81,10 @@ def measure(project: Project, sequence: str) -> MeasuredSequence:
     made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
     paths, models = project.paths(sequence), project.models(sequence)
     return MeasuredSequence(
-        SequenceMetrics.read(paths.metrics), made, count_behind_wall(paths, models)
+        SequenceMetrics.read(paths.metrics),
+        made,
+        count_behind_wall(paths, models),
+        displacements(paths, models, truth_of(project, sequence)),
     )
 
 
@@ -117,6 +124,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         "extrinsics": figures.extrinsics_figures(sequences),
         "flags": figures.flag_figures(sequences),
         "verdict": verdict_figures(known),
+        "physics": physics_figures(sequences),
     }
 
 
@@ -170,6 +178,11 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
     touched, behind = sum((e.behind_wall for m in evaluations for e in m.errors), np.zeros(2))
     if touched:
         found["contact.through_wall_share"] = float(behind / touched)
+    moved = [e.displacement for m in evaluations for e in m.errors if not e.annotated]
+    for stage in ("truth", "joint", "sequential"):
+        values = np.concatenate([np.zeros(0), *(some[stage] for some in moved if some)])
+        if len(values):
+            found[f"physics.displacement_{stage}_mm"] = 1e3 * float(values.mean())
     if "joint_annotated.contact_detected_f1" in found:
         found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
     return found

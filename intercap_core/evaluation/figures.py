@@ -53,6 +53,8 @@ class SequenceMetrics:
     """Values by dataset of the metrics artefact."""
     made_by: str = ""
     """Program that made an imported result; "" = this one."""
+    physics_note: str = ""
+    """What the physics of the object does not judge, and why; "" = nothing."""
 
     @classmethod
     def read(cls, path: Path) -> SequenceMetrics:
@@ -72,7 +74,7 @@ class SequenceMetrics:
         return cls(
             str(stated["sequence"]), str(stated["subject"]), str(stated["object"]),
             float(stated["fps"]), bool(stated["has_truth"]), values,
-            str(stated.get("made_by", "")),
+            str(stated.get("made_by", "")), str(stated.get("physics_note", "")),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -168,9 +170,10 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """Recall and precision of the flags for truly bad bodies and objects after ``joint``.
 
-    ``bad_frames`` is the share of frames whose body or object is bad.
+    ``bad_frames`` is the share of frames whose body or object is bad. ``..._with_physics``: objects
+    that physics contradicts count as flagged too.
     """
-    flagged, bad, bad_frames = [], [], []
+    flagged, physical, bad, bad_frames = [], [], [], []
     for s in sequences:
         if not s.has_truth:
             continue
@@ -179,17 +182,21 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
             wrong[:, 0] = s.values["truth/joint/body_pve"] > BAD_BODY_M
         if "truth/joint/object_translation" in s.values:
             wrong[:, 1] = _object_errors(s, "joint").lost
-        flagged.append(s.values["flagged"][:, np.isin(PARTS, ["body", "object"])].ravel())
+        own = s.values["flagged"][:, [PARTS.index("body"), PARTS.index("object")]]
+        flagged.append(own.ravel())
+        contradicted = s.values.get("physics/bad", np.zeros(len(s), bool))
+        physical.append((own | np.stack([np.zeros_like(contradicted), contradicted], 1)).ravel())
         bad.append(wrong.ravel())
         bad_frames.append(wrong.any(axis=1))
     if not bad:
         return {}
-    found, true = np.concatenate(flagged), np.concatenate(bad)
-    return {
-        "bad_frames": float(np.concatenate(bad_frames).mean()),
-        "flag_recall": contact.recall(found, true),
-        "flag_precision": contact.precision(found, true),
-    }
+    true = np.concatenate(bad)
+    result = {"bad_frames": float(np.concatenate(bad_frames).mean())}
+    for found, suffix in ((flagged, ""), (physical, "_with_physics")):
+        mask = np.concatenate(found)
+        result[f"flag_recall{suffix}"] = contact.recall(mask, true)
+        result[f"flag_precision{suffix}"] = contact.precision(mask, true)
+    return result
 
 
 def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:

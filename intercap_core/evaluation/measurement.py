@@ -112,7 +112,8 @@ class Measurement:
 
         With truth, also ``true_distance`` (T, V): signed distances of the true body's vertices from
         the true object, ``true_facing`` (T, V): their contact distances, and ``facing`` (T, V):
-        contact distances of the fitted body.
+        contact distances of the fitted body. With an object, also ``body_distance`` (T,): smallest
+        signed distance of a vertex of one to the surface of the other.
 
         Args:
             floor: point (3,) and unit normal (3,) of the floor; NaN = unknown.
@@ -224,6 +225,7 @@ class Measurement:
             "penetration_median": depth.median,
             "penetration_max": depth.max,
             "penetration_object": contact.depths(point_distance).mean,
+            "body_distance": min(to_object.min(), to_body.min()),
             "ground_penetration": np.fmax(
                 contact.ground_penetration(vertices, *floor),
                 contact.ground_penetration(object_vertices, *floor),

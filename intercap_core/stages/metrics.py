@@ -14,10 +14,12 @@ from intercap_core.evaluation import motion, object_pose
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.flags import exchanged
 from intercap_core.evaluation.measurement import HandledObject, Measurement, Values
+from intercap_core.evaluation.physics.judge import judge_physics
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.segmented import read_clouds
 from intercap_core.evaluation.stage_errors import StageErrors
 from intercap_core.evaluation.tracks import BodyTrack, read_body, read_object
+from intercap_core.evaluation.verdict.hold_out import JudgedPart
 from intercap_core.evaluation.verdict.judge import reach_verdict
 from intercap_core.flags import OF_BODY, PARTS, Cause, Flags
 from intercap_core.formats.recordings.frames import Frames
@@ -44,7 +46,8 @@ def run(
     output: Path,
     truth: Path | None = None,
 ) -> None:
-    """Measure the joint result of one sequence, estimate its error, compare all stages with truth.
+    """Measure the joint result of one sequence, estimate its error, test its physics, and compare
+    all stages with truth.
 
     Object and contact metrics are omitted if the sequence has no object, or if the object was found
     in no frame. In the second case its errors against truth are infinite.
@@ -69,15 +72,28 @@ def run(
             paths, models, settings, truth, rig, body_track, writer
         )
         writer.attributes.update(attributes)
+        body_distance = values.pop("body_distance", None)
         for key in sorted(values):
             writer.put(key, values.pop(key))
         flags.write(writer)
+        verdict: Values = {}
         # The error model of the verdict was fitted to results of this program, so imported results
         # have none.
         if settings.hold_out and not made_by:
             return_freed_memory()
-            for key, value in sorted(reach_verdict(paths, models, fit_settings).items()):
+            verdict |= reach_verdict(paths, models, fit_settings)
+            for key, value in sorted(verdict.items()):
                 writer.put(f"verdict/{key}", value)
+        if body_distance is not None and models.object_ is not None:
+            estimated = None
+            if verdict:
+                part = verdict["part_names"].index(JudgedPart.OBJECT)
+                estimated = verdict["error_frame"][part]
+            mesh = ObjectMesh.load(models.object_)
+            physics, note = judge_physics(mesh, paths, body_distance, flags, estimated)
+            for key, value in sorted(physics.items()):
+                writer.put(f"physics/{key}", value)
+            writer.attributes["physics_note"] = note
 
 
 def _measure(

@@ -146,8 +146,9 @@ class ObjectMesh:
         return float(np.linalg.norm(self.vertices - self.centre_of_mass, axis=1).max())
 
     def centre_at(self, pose: np.ndarray) -> np.ndarray:
-        """Return the centre of mass (3,) at a pose a_from_object (4, 4), in frame a, metres."""
-        return pose[:3, :3] @ self.centre_of_mass + pose[:3, 3]
+        """Return the centre of mass (..., 3) at poses a_from_object (..., 4, 4), in frame a,
+        metres."""
+        return pose[..., :3, :3] @ self.centre_of_mass + pose[..., :3, 3]
 
     @cached_property
     def diameter(self) -> float:
