@@ -20,7 +20,8 @@ from bench.evaluate.part import (
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.physics.figures import displacements, physics_figures
+from intercap_core.evaluation.physics.at_truth import displacements
+from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.through_wall import count_behind_wall
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project

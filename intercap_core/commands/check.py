@@ -239,17 +239,20 @@ def _check_annotations(project: Project, findings: Findings) -> None:
 
 def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:
     """Error message if an object's mesh cannot be used; warnings on a usable one become notes."""
+    from intercap_core.evaluation.physics.judge import without_volume
     from intercap_core.geometry.rigid import mesh
 
     warnings = BufferingHandler(capacity=1000)
     mesh.log.addHandler(warnings)
     mesh.log.propagate = False
     try:
-        mesh.ObjectMesh.load(project.objects[name])
+        loaded = mesh.ObjectMesh.load(project.objects[name])
     except UserError as error:
         return str(error)
     finally:
         mesh.log.removeHandler(warnings)
         mesh.log.propagate = True
     findings.notes += [Fault("", record.getMessage()) for record in warnings.buffer]
+    if why := without_volume(loaded):
+        findings.notes.append(Fault("", f"{why}: metrics leaves out its physics"))
     return None

@@ -24,6 +24,7 @@ LIBRARIES = (
     "numpy", "numba", "torch", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "libigl",
     "trimesh", "av", "onnxruntime", "onnxruntime-gpu",
 )  # fmt: skip
+OWN_LIBRARIES = {"metrics": ("mujoco",)}  # libraries that influence only the results of one stage
 FILE = ".made_from.json"  # manifest of a folder, inside it
 FORMAT = 1
 DATASET_OUTPUTS = (
@@ -183,10 +184,11 @@ def _listed_links(folder: Path) -> dict[tuple[int, int], str]:
 
 
 @cache
-def library_versions() -> dict[str, str]:
-    """Versions of the installed ``LIBRARIES``, without the build tag after "+" (torch)."""
+def library_versions(stage: str = "") -> dict[str, str]:
+    """Versions of the installed ``LIBRARIES`` and those of a stage, without the build tag after "+"
+    (torch)."""
     versions = {}
-    for name in LIBRARIES:
+    for name in (*LIBRARIES, *OWN_LIBRARIES.get(stage, ())):
         with contextlib.suppress(PackageNotFoundError):
             versions[name] = version(name).partition("+")[0]
     return versions

@@ -198,7 +198,7 @@ def _manifest(
         files=files,
         artefacts=dict(artefacts),
         code=stage_code(stage).digests,
-        libraries=library_versions(),
+        libraries=library_versions(stage),
         machine=dict(machine),
     )
 

@@ -19,7 +19,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export import body_files, images
-from intercap_core.output.export.about import About, Deviations, ExportBody, Verdict
+from intercap_core.output.export.about import About, Deviations, ExportBody, Physics, Verdict
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.format import Content
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
@@ -127,6 +127,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
         Verdict.of(measured),
         None if mesh is None else ContactVertices.read(paths.metrics, motion, mesh),
         None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
+        None if mesh is None else Physics.of(measured),
         motion.made_by,
         measured.has_truth,
     )
@@ -156,6 +157,7 @@ def _write_manifest(
         "body": about.body.to_json(),
         "body_files": body,
         **about.verdict.to_json(),
+        **({} if about.physics is None else about.physics.to_json()),
         "files": {
             path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in files

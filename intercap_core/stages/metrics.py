@@ -86,7 +86,7 @@ def run(
                 writer.put(f"verdict/{key}", value)
         if body_distance is not None and models.object_ is not None:
             estimated = None
-            if verdict:
+            if JudgedPart.OBJECT in verdict.get("part_names", ()):
                 part = verdict["part_names"].index(JudgedPart.OBJECT)
                 estimated = verdict["error_frame"][part]
             mesh = ObjectMesh.load(models.object_)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,23 @@ def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
     parts = [PARTS[p] for p in np.flatnonzero(measured["flagged"][4])]
     assert parts == ["body", "hands", "contact"]
     assert not measured["flagged"][1:4].any()
+
+
+def test_the_hand_carries_the_object(measured: dict[str, np.ndarray]) -> None:
+    pytest.importorskip("mujoco", reason="the extra physics is not installed")
+    carriers = [str(name) for name in measured["physics/carrier"]]
+    assert carriers == ["body"] * len(carriers)
+    assert not len(measured["physics/release_frame"]) and not measured["physics/bad"].any()
+
+
+def test_without_the_library_the_extra_is_named(
+    capture: fitted.Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)  # its import fails
+    output = capture.measure(tmp_path / "metrics.h5")
+    with artefacts.read(output, METRICS) as artefact:
+        assert not artefact.keys("physics/")
+        assert "intercap-core[physics]" in str(artefact.attributes["physics_note"])
 
 
 def test_without_truth_all_other_values_are_the_same(

@@ -141,7 +141,7 @@ def judge_physics(
         estimated: (T,) error of the object that the verdict estimates, metres, NaN = none; None =
             no verdict.
     """
-    if why := missing_library() or _without_volume(mesh):
+    if why := missing_library() or without_volume(mesh):
         log.warning("physics is left out: %s", why)
         return {}, why
     test = PhysicsTest(mesh, paths)
@@ -153,13 +153,8 @@ def judge_physics(
         test, rests, free=(body_distance > near) & ~touched
     )
     floor = gap if test.static.floor else np.full(len(gap), np.nan)
-    acceleration, deviation = support_acceleration(
-        np.where(
-            test.tracked, apply(test.up_from_master, mesh.centre_at(test.poses))[:, 2], np.nan
-        ),
-        test.sigma,
-        test.times,
-    )
+    height = mesh.centre_at(test.in_scene(test.poses))[:, 2]
+    acceleration, deviation = support_acceleration(height, test.sigma, test.times)
     apart = (body_distance > near) & ~touched & ~(floor <= near) & test.tracked
     distances = Distances(
         body=body_distance,
@@ -167,7 +162,7 @@ def judge_physics(
         furniture=_furniture_distances(test, apart),
         sigma=test.sigma,
         touched=touched,
-        body_known=~flags.flagged[:, np.isin(PARTS, OF_BODY[:2])].any(axis=1),
+        body_known=np.logical_not(flags.flagged[:, np.isin(PARTS, OF_BODY[:2])].any(axis=1)),
     )
     confirmed = ~flags.flagged[:, PARTS.index("object")] & (np.sqrt(3) * test.sigma < BAD_OBJECT_M)
     if estimated is not None:
@@ -197,13 +192,13 @@ def judge_physics(
     }, "; ".join(notes)
 
 
-def _without_volume(mesh: ObjectMesh) -> str:
+def without_volume(mesh: ObjectMesh) -> str:
     """Why a mesh has no defined mass; "" for a closed mesh."""
     if mesh.watertight:
         return ""
     return (
-        f"the mesh of {mesh.name} is not closed, so its centre of mass is unknown; close it "
-        "(`intercap close-mesh`)"
+        f"the mesh of {mesh.name} is not closed, so it has no volume and no centre of mass "
+        "(`intercap close-mesh` closes small holes)"
     )
 
 

@@ -17,6 +17,7 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.verdict.figures import (
     IMAGE_MEASURES,
     HeldOutCamera,
@@ -179,6 +180,41 @@ def _camera_to_json(camera: HeldOutCamera) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
+class Physics:
+    """Physics of the object over T frames: see :mod:`intercap_core.evaluation.physics`."""
+
+    figures: dict[str, float]
+    """Figures of :func:`.physics_figures`."""
+    carriers: Sequence[str]
+    """(T,) what carries the object; empty = not tested."""
+    bad: np.ndarray
+    """(T,) bool, physics contradicts the pose."""
+    note: str
+    """What is not judged, and why; "" = nothing."""
+
+    @classmethod
+    def of(cls, metrics: SequenceMetrics) -> Physics:
+        values = metrics.values
+        return cls(
+            physics_figures([metrics]),
+            [str(name) for name in values.get("physics/carrier", ())],
+            values.get("physics/bad", np.zeros(0, bool)),
+            metrics.physics_note,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Serialize everything but the values per frame."""
+        figures = {name: round(value, 3) for name, value in self.figures.items()}
+        return {"physics": figures | ({"note": self.note} if self.note else {})}
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize the values per frame for npz files."""
+        if not self.carriers:
+            return {}
+        return {"carrier": np.array(self.carriers), "physics_bad": self.bad}
+
+
+@dataclass(frozen=True, eq=False)
 class Deviations:
     """Standard deviations along one coordinate that the sequential fits state.
 
@@ -267,6 +303,8 @@ class About:
     """Contact by vertex; None without an object."""
     deviations: Deviations | None = None
     """Standard deviations; None for imported results, which state none."""
+    physics: Physics | None = None
+    """Physics of the object; None without an object."""
     made_by: str = ""
     """The other program that made an imported result."""
     virtual: bool = False
@@ -286,6 +324,8 @@ class About:
         }
         if self.made_by:
             entries["made_by"] = self.made_by
+        if self.physics is not None:
+            entries |= self.physics.to_json()
         if self.contact is not None:
             entries["contact"] = [
                 interval.model_dump(include={"part", "start", "end"})
@@ -324,6 +364,8 @@ class About:
             arrays |= self.touching.to_arrays()
         if self.deviations is not None:
             arrays |= self.deviations.to_arrays()
+        if self.physics is not None:
+            arrays |= self.physics.to_arrays()
         return arrays
 
     def _per_frame_json(self) -> dict[str, Any]:
@@ -338,4 +380,6 @@ class About:
             entries |= self.touching.to_json()
         if self.deviations is not None:
             entries |= self.deviations.to_json()
+        if self.physics is not None:
+            entries |= {key: values.tolist() for key, values in self.physics.to_arrays().items()}
         return entries

@@ -22,6 +22,7 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.config import CardSettings
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.flags import PARTS
@@ -215,6 +216,7 @@ def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
         "body_to_cloud_mm": _plain(clouds["body_visible_mm"]),
         "object_to_cloud_mm": _plain(clouds.get("object_visible_mm", np.nan)),
         "penetration_mm": _plain(depth.get("mean_mm", np.nan)),
+        "physics": {name: _plain(value) for name, value in physics_figures(measured).items()},
     }
     if any(s.has_truth for s in measured):
         true = figures.truth_figures(measured, "joint")

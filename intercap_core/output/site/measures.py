@@ -12,12 +12,15 @@ import numpy as np
 
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.figures import physics_figures
+from intercap_core.evaluation.physics.rest_test import RELEASED_FRAMES
 from intercap_core.evaluation.verdict.figures import (
     StatedError,
     held_out_cameras,
     stated_errors,
 )
 from intercap_core.output.site import charts
+from intercap_core.output.site.embed import tile
 from intercap_core.stage_list import ESTIMATES
 
 _MAX_CAMERA_ROWS = 40
@@ -188,6 +191,18 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
             marks=((5, "5"), (7, "7"), (20, "20")),
         ),
     }
+
+
+def physics_tile(sequences: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
+    """Return the tile of the rest test; none if no object was released."""
+    found = physics_figures(sequences)
+    if "displacement_mm" not in found:
+        return []
+    note = (
+        f"mean over {found['releases']:.0f} releases at rest, {RELEASED_FRAMES} simulated frames; "
+        f"unsupported in {100 * found['unsupported_share']:.0f} % of the frames"
+    )
+    return [tile("object moves when released", found["displacement_mm"], "mm", note)]
 
 
 def accelerations(sequences: Sequence[SequenceMetrics]) -> str:

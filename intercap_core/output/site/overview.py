@@ -184,6 +184,7 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     handling = any(s.has_object for s in measured)
     if handling:
         tiles.append(tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"))
+        tiles += measures.physics_tile(measured)
     tiles.append(tile("body to point cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if handling:
         tiles.append(

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from intercap_core.annotation import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.carriers import Carrier
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.output.site import charts, measures
@@ -91,6 +92,7 @@ def page(content: SequenceContent) -> str:
         "flagged_text": s.flags.summary(),
         "energies": _energies(content.energies),
         "joint": content.joint,
+        "physics_note": s.physics_note,
         "cameras": cameras,
         "note": content.note,
         "preview": content.preview,
@@ -134,6 +136,7 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
         )
         depth = figures.penetration_figures([s]).get("mean_mm")
         tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
+        tiles += measures.physics_tile([s])
         share = 100 * float(s.values["contact_frame"].mean())
         tiles.append(tile("in contact", share, "%", "of the frames", 0))
     return [*tiles, flag_tile(s.flags, has_object=s.has_object)]
@@ -159,6 +162,14 @@ def _rows(
     if not s.has_object:
         return rows
     rows.append(charts.TimelineRow("in contact", _runs(s.values["contact_frame"])))
+    if "physics/carrier" in s.values:
+        carriers = [str(name) for name in s.values["physics/carrier"]]
+        bad = (Carrier.UNSUPPORTED, Carrier.UNKNOWN)
+        runs = [
+            (a, b, "fill flag" if name in bad else "fill any", f"{span(a, b)}: {name}")
+            for a, b, name in flags.ranges(carriers)
+        ]
+        rows.append(charts.TimelineRow("carried by", runs))
     names = list(s.values["region_names"])
     if "any" in annotated_runs:
         rows.append(charts.TimelineRow("any part, annotated", annotated_runs["any"]))

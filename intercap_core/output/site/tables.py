@@ -12,6 +12,7 @@ from pyarrow import csv
 
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import (
     IMAGE_MEASURES,
@@ -92,6 +93,7 @@ def _figures(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
     """Pool penetration, distances to clouds with their noise floor, and accelerations."""
     row = {
         **_prefixed("penetration", figures.penetration_figures(sequences)),
+        **_prefixed("physics", physics_figures(sequences)),
         **_prefixed("vertex_to_cloud", figures.cloud_figures(sequences)),
         **_prefixed("vertex_to_cloud_floor", figures.floor_figures(sequences)),
     }
