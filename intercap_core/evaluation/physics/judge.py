@@ -23,14 +23,16 @@ from intercap_core.evaluation.physics.carriers import (
     support_acceleration,
 )
 from intercap_core.evaluation.physics.rest_test import FallingBody, missing_library
-from intercap_core.evaluation.physics.supports import StaticScene, Support
-from intercap_core.evaluation.proximity import REACH_M, PosedObject
+from intercap_core.evaluation.physics.supports import REACH_M, StaticScene, Support
+from intercap_core.evaluation.proximity import REACH_M as DISTANCE_CAP_M
+from intercap_core.evaluation.proximity import MeasuredCloud, PosedObject
 from intercap_core.evaluation.tracks import read_object
 from intercap_core.flags import OF_BODY, PARTS, Flags
 from intercap_core.geometry.camera.clouds import depth_points
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.schemas import CONTACT_M, JOINT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
@@ -40,6 +42,9 @@ Values = dict[str, np.ndarray | list[str]]
 
 BAD_OBJECT_M = 0.020  # estimated error above which the images do not confirm a pose, metres
 BAD_REST_M = 0.050  # displacement of a released object above which its pose is bad, metres
+# Share of the surface above the support that a wall touches at most; an object in the background
+# touches itself on a third of its surface or more (three of six cameras see each point).
+LEANING_SHARE = 0.1
 MAX_RELEASES = 24  # of a sequence; one takes 7 ms
 _SURROUNDINGS_M = 0.15  # static points are kept up to this distance from the object's way
 
@@ -62,6 +67,10 @@ class PhysicsTest:
     def __init__(self, mesh: ObjectMesh, paths: SequencePaths) -> None:
         """Read scene, joint fit and object track; raises UserError as reading does."""
         self.mesh, self.body = mesh, FallingBody(mesh)
+        self._surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
+        self._samples = sample_surface(mesh.vertices, mesh.faces, 1000).of(
+            mesh.vertices, mesh.faces
+        )
         track = read_object(paths.joint, "joint")
         self.poses = rigid(track.rotation, track.translation)
         """(T, 4, 4) master_from_object after ``joint``."""
@@ -99,9 +108,39 @@ class PhysicsTest:
     def rests(self) -> list[Rest]:
         """Rests of the object with their supports, by the pose in the middle frame."""
         return [
-            Rest(first, last, self.support(self.poses[(first + last) // 2], self.sigma[first]))
+            Rest(first, last, self.support(self.poses[t], self.sigma[t]))
             for first, last in runs(self.resting)
+            for t in [(first + last) // 2]
         ]
+
+    def leans(self, t: int, support: Support) -> bool:
+        """Whether something static touches the object above its support in frame ``t``.
+
+        An object that is seldom moved is part of the background. Its own points cover much of its
+        surface, those of a wall that it leans on only a patch.
+        """
+        points, _ = self.static_around(t)
+        placed = self.in_scene(self.poses[t])
+        surface = apply(placed, self._samples)
+        above = surface[surface[:, 2] > support.height + REACH_M]
+        if not len(points) or not len(above):
+            return False
+        touched = MeasuredCloud(points).distance(above) < CONTACT_M + 2 * self.sigma[t]
+        return bool(0 < touched.mean() < LEANING_SHARE)
+
+    def static_around(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Static points (N, 3), z up, near the object in frame ``t``, and distances (N,), metres.
+
+        Distances are signed: negative inside the object.
+        """
+        placed = self.in_scene(self.poses[t])
+        shape = apply(placed, self.body.hull)
+        margin = DISTANCE_CAP_M
+        points = self.static.near(shape.min(axis=0) - margin, shape.max(axis=0) + margin)
+        if not len(points):
+            return points, np.zeros(0)
+        local = apply(invert(placed), points)
+        return points, self._surface.signed_distance(local, np.eye(3), np.zeros(3))
 
     def support(self, pose: np.ndarray, sigma: float) -> Support:
         """The surface under the object at a pose (4, 4) master_from_object."""
@@ -211,46 +250,38 @@ def _release(
     rests that are not judged. ``free``: (T,) bool, no contact with the body.
     """
     frames: list[int] = []
+    moved: list[float] = []
     supports: list[str] = []
     notes = []
     for rest in rests:
         usable = np.flatnonzero(free[rest.first : rest.last + 1]) + rest.first
         if not len(usable):
             continue
-        if not rest.support.known:
-            notes.append(f"frames {rest.first} to {rest.last} not judged: {rest.support.reason}")
+        reason = rest.support.reason
+        some = np.unique(usable[[0, len(usable) // 2, -1]])[: MAX_RELEASES - len(frames)]
+        own = [] if reason else [test.displacement(test.poses[t], test.sigma[t]) for t in some]
+        if len(own) and max(own) > BAD_REST_M and test.leans(int(some[0]), rest.support):
+            reason = "it may lean on something"
+        if reason:
+            notes.append(f"frames {rest.first} to {rest.last} not judged: {reason}")
             continue
-        some = np.unique(usable[[0, len(usable) // 2, -1]]).tolist()
-        some = some[: MAX_RELEASES - len(frames)]
-        frames += some
-        supports += [rest.support.name] * len(some)
-    moved = [test.displacement(test.poses[t], test.sigma[t]) for t in frames]
-    known = np.isfinite(moved)
-    return (
-        np.array(frames, np.int32)[known],
-        np.array(moved, np.float64)[known],
-        [name for name, on in zip(supports, known, strict=True) if on],
-        notes,
-    )
+        known = np.isfinite(own)
+        frames += some[known].tolist()
+        moved += np.array(own)[known].tolist()
+        supports += [rest.support.name] * int(known.sum())
+    return np.array(frames, np.int32), np.array(moved, np.float64), supports, notes
 
 
 def _furniture_distances(test: PhysicsTest, wanted: np.ndarray) -> np.ndarray:
-    """Distances (T,) of the object to the static points, at most ``REACH_M``; metres.
+    """Distances (T,) of the object to the static points, at most ``DISTANCE_CAP_M``; metres.
 
     NaN in frames outside the mask ``wanted`` (T,), and without background depth.
     """
     found = np.full(len(wanted), np.nan)
     if not wanted.any() or not len(test.static.points):
         return found
-    surface = PosedObject(test.mesh.vertices, test.mesh.faces, watertight=test.mesh.watertight)
     for t in np.flatnonzero(wanted):
-        placed = test.in_scene(test.poses[t])
-        shape = apply(placed, test.body.hull)
-        points = test.static.near(shape.min(axis=0) - REACH_M, shape.max(axis=0) + REACH_M)
-        found[t] = REACH_M
-        if len(points):
-            local = apply(invert(placed), points)
-            found[t] = surface.signed_distance(local, np.eye(3), np.zeros(3)).min()
+        found[t] = test.static_around(t)[1].min(initial=DISTANCE_CAP_M)
     return found
 
 

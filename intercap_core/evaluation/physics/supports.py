@@ -63,7 +63,7 @@ class StaticScene:
         """
         reach = REACH_M + 2 * deviation
         bottom = float(shape[:, 2].min())
-        if self.floor and abs(bottom) <= reach:
+        if self.floor and bottom <= reach:
             return Support("floor", 0.0)
         low = shape[shape[:, 2] < bottom + REACH_M, :2]
         corners = low.min(axis=0) - FOOTPRINT_MARGIN_M, low.max(axis=0) + FOOTPRINT_MARGIN_M
