@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 Values = dict[str, np.ndarray | list[str]]
 
 BAD_OBJECT_M = 0.020  # estimated error above which the images do not confirm a pose, metres
-BAD_REST_M = 0.050  # displacement of a released object above which its pose is bad, metres
+BAD_REST_M = 0.050  # displacement of a released object above which its pose counts as lost, metres
 # Share of the surface above the support that a wall touches at most; an object in the background
 # touches itself on a third of its surface or more (three of six cameras see each point).
 LEANING_SHARE = 0.1
