@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,10 +96,11 @@ class PhysicsTest:
             self.sigma = np.sqrt(np.where(self.tracked, variance, np.nan))
             """(T,) standard deviation of the position along one axis, metres."""
         margin = mesh.radius + _SURROUNDINGS_M
+        self.static = StaticScene(floor, len(points) > 0, points)
         if self.tracked.any():
             low, high = way[self.tracked].min(axis=0), way[self.tracked].max(axis=0)
-            points = StaticScene(floor, points).near(low - margin, high + margin)
-        self.static = StaticScene(floor, points)
+            points = self.static.near(low - margin, high + margin)
+            self.static = replace(self.static, points=points)
 
     def in_scene(self, poses: np.ndarray) -> np.ndarray:
         """Poses (T, 4, 4) master_from_object as transforms from the object to z up."""
@@ -278,7 +279,7 @@ def _furniture_distances(test: PhysicsTest, wanted: np.ndarray) -> np.ndarray:
     NaN in frames outside the mask ``wanted`` (T,), and without background depth.
     """
     found = np.full(len(wanted), np.nan)
-    if not wanted.any() or not len(test.static.points):
+    if not test.static.measured:
         return found
     for t in np.flatnonzero(wanted):
         found[t] = test.static_around(t)[1].min(initial=DISTANCE_CAP_M)

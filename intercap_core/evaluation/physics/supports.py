@@ -50,8 +50,10 @@ class StaticScene:
 
     floor: bool
     """Whether z = 0 is the floor."""
+    measured: bool
+    """Whether the background depth of a camera is known."""
     points: np.ndarray
-    """(N, 3) background points of all cameras, metres; empty without depth."""
+    """(N, 3) background points of all cameras, metres; perhaps those near the object only."""
 
     def support_under(self, shape: np.ndarray, centre: np.ndarray, deviation: float) -> Support:
         """The surface on which an object rests.

@@ -99,22 +99,22 @@ def support(scene: StaticScene, pose: np.ndarray):
 
 
 def test_floor_and_furniture_carry() -> None:
-    scene = StaticScene(True, table(0.7))
+    scene = StaticScene(True, True, table(0.7))
     assert support(scene, at(0.21)).name == "floor"
     found = support(scene, at(0.91))
     assert found.name == "furniture" and found.height == pytest.approx(0.7, abs=0.001)
 
 
 def test_a_support_that_the_scene_does_not_hold_is_named() -> None:
-    scene = StaticScene(True, table(0.7))
+    scene = StaticScene(True, True, table(0.7))
     assert "no surface" in support(scene, at(1.5)).reason
-    assert "no surface" in support(StaticScene(False, np.zeros((0, 3))), at(0.2)).reason
+    assert "no surface" in support(StaticScene(False, False, np.zeros((0, 3))), at(0.2)).reason
     beside = at(0.9)
     beside[0, 3] += 0.45
     assert "beside" in support(scene, beside).reason
     rough = table(0.7)
     rough[:, 2] += np.random.default_rng(1).uniform(-0.03, 0.03, len(rough))
-    assert "not level" in support(StaticScene(True, rough), at(0.9)).reason
+    assert "not level" in support(StaticScene(True, True, rough), at(0.9)).reason
 
 
 TIMES = np.arange(40) / FPS
