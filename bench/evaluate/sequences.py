@@ -124,7 +124,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         "vertex_to_cloud_floor": figures.floor_figures(sequences),
         "extrinsics": figures.extrinsics_figures(sequences),
         "flags": figures.flag_figures(sequences),
-        "verdict": verdict_figures(known),
+        "verdict": verdict_figures(known) | figures.bad_frame_figures(known),
         "physics": physics_figures(sequences),
     }
 

@@ -199,6 +199,16 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     return result
 
 
+def bad_frame_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """The figures of :func:`flag_figures` as ``bad_recall`` and ``bad_precision``, without unknown
+    ones."""
+    return {
+        name.replace("flag_", "bad_"): value
+        for name, value in flag_figures(sequences).items()
+        if name.startswith("flag_") and np.isfinite(value)
+    }
+
+
 def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """Mean and worst true displacement of the cameras, millimetres.
 

@@ -281,7 +281,7 @@ def _furniture_distances(test: PhysicsTest, wanted: np.ndarray) -> np.ndarray:
     found = np.full(len(wanted), np.nan)
     if not test.static.measured:
         return found
-    for t in np.flatnonzero(wanted):
+    for t in np.flatnonzero(wanted).tolist():
         found[t] = test.static_around(t)[1].min(initial=DISTANCE_CAP_M)
     return found
 

@@ -201,9 +201,6 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     - ``range_factor_<part>``: median of the factor of that range.
     - ``bad_sequences``: number of items with a true error above 20 mm.
     - ``bad_sequence_recall``: share of these whose stated error is above 20 mm too.
-    - ``bad_recall``, ``bad_precision``: of the flags, for frames whose body is off by more than
-      ``BAD_BODY_M`` or whose object is lost. ``..._with_physics``: with objects that physics
-      contradicts.
     """
     from scipy.stats import spearmanr  # takes a second to import, which most processes do not need
 
@@ -232,8 +229,4 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     if bad.any():
         result["bad_sequence_recall"] = float((stated[bad] > bad_mm).mean())
         result["bad_sequences"] = float(bad.sum())
-    flags = figures.flag_figures(sequences)
-    for name, value in flags.items():
-        if name.startswith("flag_") and np.isfinite(value):
-            result[name.replace("flag_", "bad_")] = value
     return result
