@@ -10,6 +10,7 @@ host's, so that device times count from 1970 (timer_sync_with_host in ob_k4a_imp
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -136,8 +137,7 @@ class KinectFile(ClosedOnExit):
             kind = kinds[packet.stream_index]
             content = bytes(packet)
             time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
-            width, height = self._depth_size
-            is_whole = kind != "depth" or 0 < len(content) == 2 * width * height
+            is_whole = kind != "depth" or 0 < len(content) == 2 * math.prod(self._depth_size)
             if is_whole and abs(time_us) <= containers.LATEST_US:
                 yield Packet(kind, time_us, content)
             else:
@@ -154,14 +154,12 @@ class KinectFile(ClosedOnExit):
     def preview(self) -> RecordingPreview:
         """Inspect the colour track without reading the others."""
         seen = containers.preview_video(self.path, self._tracks["colour"].index, self.info.fps)
-        if self.info.colour_format != "MJPG":
-            return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
-        return seen
+        is_raw = self.info.colour_format != "MJPG"
+        return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size) if is_raw else seen
 
     def depth_image(self, content: bytes) -> np.ndarray:
         """Convert a depth packet to (H, W) uint16, millimetres, 0 = invalid."""
-        width, height = self._depth_size
-        return np.frombuffer(content, ">u2").reshape(height, width).astype(np.uint16)
+        return np.frombuffer(content, ">u2").reshape(self._depth_size[::-1]).astype(np.uint16)
 
     def camera(self, name: str, master_from_colour: np.ndarray | None = None) -> Camera:
         """The device's lenses as a camera; raises UserError if the calibration is broken.
@@ -181,8 +179,6 @@ class KinectFile(ClosedOnExit):
         """Rotation (3, 3) from accelerometer to colour axes; None if not calibrated."""
         return colour_from_accelerometer(self.info.calibration, source=str(self.path))
 
-    # --- the head of the file ---------------------------------------------------------------
-
     def _find_tracks(self) -> dict[Kind, Any]:
         """Streams by kind, found by the tag, else by the name."""
         tracks: dict[Kind, Any] = {}
@@ -201,12 +197,15 @@ class KinectFile(ClosedOnExit):
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
                 "colour; record with k4arecorder and the colour camera on"
             )
+        has_depth = depth is not None and depth.codec_context is not None
+        if has_depth and depth.metadata.get("K4A_DEPTH_MODE") == "PASSIVE_IR":
+            has_depth = False  # infrared alone
         fps = float(colour.average_rate or 30)
         check_rate(fps, str(self.path))
         return KinectFileInfo(
-            colour_mode=self._mode("colour", colour, "K4A_COLOR_MODE", COLOUR_MODES),
+            colour_mode=self._mode("colour", colour, COLOUR_MODES),
             colour_format=self._colour_format(colour),
-            depth_mode=self._depth_mode(depth),
+            depth_mode=self._mode("depth", depth, DEPTH_MODES) if has_depth else None,
             fps=fps,
             serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
             start_offset_us=self._microseconds("K4A_START_OFFSET_NS", containers.LATEST_US),
@@ -226,23 +225,15 @@ class KinectFile(ClosedOnExit):
             f"MJPG, {', '.join(encodings.RAW_FORMATS)}; record in a colour mode of k4arecorder"
         )
 
-    def _depth_mode(self, depth: Any) -> str | None:
-        if (
-            depth is None
-            or depth.codec_context is None
-            or depth.metadata.get("K4A_DEPTH_MODE") == "PASSIVE_IR"  # infrared alone, no depth
-        ):
-            return None
-        return self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES)
-
-    def _mode(self, kind: str, stream: Any, tag: str, known: dict[str, Any]) -> str:
+    def _mode(self, kind: Kind, stream: Any, known: dict[str, Any]) -> str:
         """The mode whose images have the track's size; no two modes share a size."""
         size = (stream.codec_context.width, stream.codec_context.height)
         name = next((mode for mode, entry in known.items() if entry.size == size), None)
         if name is None:
+            stated = stream.metadata.get(f"K4A_{TRACKS[kind]}_MODE", "without a name")
             raise UserError(
-                f"{self.path}: {kind} mode {stream.metadata.get(tag, 'without a name')} has images "
-                f"of {size[0]}x{size[1]}, expected one of {', '.join(known)}; record in one of them"
+                f"{self.path}: {kind} mode {stated} has images of {size[0]}x{size[1]}, expected "
+                f"one of {', '.join(known)}; record in one of them"
             )
         return name
 
@@ -304,11 +295,8 @@ def find_cameras(recordings: Path) -> list[str]:
 
 
 def _find_files(recordings: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in recordings.iterdir()
-        if path.suffix.lower() == ".mkv" and not path.name.startswith(".")
-    )
+    files = (path for path in recordings.iterdir() if path.suffix.lower() == ".mkv")
+    return sorted(path for path in files if not path.name.startswith("."))
 
 
 def _is_kinect_file(path: Path) -> bool:

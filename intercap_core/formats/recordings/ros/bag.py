@@ -87,11 +87,6 @@ class Bag(ClosedOnExit):
         """Close the files."""
         self._reader.close()
 
-    @property
-    def end_ns(self) -> int:
-        """Time at which the last message was recorded, nanoseconds."""
-        return int(self._reader.end_time)
-
     def messages(self, *topics: str) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time of recording (ns) and message of ``topics``, in order of recording."""
         connections = [c for c in self._reader.connections if c.topic in topics]
