@@ -197,9 +197,9 @@ class KinectFile(ClosedOnExit):
                 f"{self.path}: has no COLOR track, so it is not an Azure Kinect recording with "
                 "colour; record with k4arecorder and the colour camera on"
             )
-        has_depth = depth is not None and depth.codec_context is not None
-        if has_depth and depth.metadata.get("K4A_DEPTH_MODE") == "PASSIVE_IR":
-            has_depth = False  # infrared alone
+        has_depth = False
+        if depth is not None and depth.codec_context is not None:
+            has_depth = depth.metadata.get("K4A_DEPTH_MODE") != "PASSIVE_IR"  # infrared alone
         fps = float(colour.average_rate or 30)
         check_rate(fps, str(self.path))
         return KinectFileInfo(
