@@ -27,17 +27,17 @@ from bench import annotate_page
 from bench.annotate_page import Hand, Point
 from bench.command import exit_on_user_error, replace_figures
 from bench.evaluate.objects import measure
+from bench.evaluate.sequence_figures import stated_contact_figures
 from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.annotate.rerun import targets
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
-from intercap_core.evaluation.contact_figures import stated_contact_figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.flags import runs
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import METRIC_REGIONS, SCENE, TRUTH
 

@@ -271,7 +271,7 @@ class JointClip:
             artefacts.read(paths["object_track"], OBJECT_TRACK) as track,
             artefacts.read(paths["scene"], SCENE) as scene,
         ):
-            model = load_model(models, str(fitted.attributes["gender"]), fitted, device="cpu")
+            model = load_model(models, str(fitted.attributes["gender"]), fitted)
             sequential = SequentialFits.read(fitted, track, scene)
             settled = Settled(*(torch.from_numpy(fitted[name]) for name in _SETTLED))
             failed = fitted["failed"]

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.evaluate import capture_errors, track_errors
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
-from intercap_core.evaluation import body, contact, object_errors, scene_errors
+from intercap_core.evaluation import body, contact, object_errors
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
@@ -83,9 +84,10 @@ def figures_of(stage: str, written: Sequence[Written]) -> Figures:
 def _scene(written: Sequence[Written]) -> Figures:
     """Figures of the scene; flags are weak camera pairs and cameras with a note."""
     errors = [
-        scene_errors.measure(w.artefacts["frames"], w.artefacts["scene"], w.truth) for w in written
+        capture_errors.measure(w.artefacts["frames"], w.artefacts["scene"], w.truth)
+        for w in written
     ]
-    found = _named(scene_errors.figures(errors), CAPTURE_FIGURES)
+    found = _named(capture_errors.figures(errors), CAPTURE_FIGURES)
     flags = 0
     for one in written:
         with artefacts.read(one.artefacts["scene"], SCENE) as scene:
@@ -115,7 +117,7 @@ def _person(written: Sequence[Written]) -> Figures:
 
 def _object_track(written: Sequence[Written]) -> Figures:
     errors = [
-        object_errors.measure(w.artefacts["scene"], w.artefacts["object_track"], w.truth, w.mesh)
+        track_errors.measure(w.artefacts["scene"], w.artefacts["object_track"], w.truth, w.mesh)
         for w in written
     ]
     found = _named(object_errors.figures(errors), OBJECT_FIGURES)

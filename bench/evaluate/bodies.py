@@ -12,6 +12,8 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.table import Table
 
+from bench.evaluate import body_errors
+from bench.evaluate.body_errors import BodyErrors
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -26,8 +28,6 @@ from bench.evaluate.part import (
 )
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.config import Config
-from intercap_core.evaluation import body_errors
-from intercap_core.evaluation.body_errors import BodyErrors
 from intercap_core.project import Project
 
 Bodies = Measured[BodyErrors]

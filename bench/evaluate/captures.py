@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.evaluate import capture_errors
+from bench.evaluate.capture_errors import CaptureErrors
 from bench.evaluate.part import (
     SPREAD,
     EvaluationPart,
@@ -19,8 +21,6 @@ from bench.evaluate.part import (
     with_spread,
 )
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.evaluation import scene_errors
-from intercap_core.evaluation.scene_errors import CaptureErrors
 from intercap_core.project import Project
 
 Captures = Measured[CaptureErrors]
@@ -29,14 +29,14 @@ Captures = Measured[CaptureErrors]
 def measure(project: Project, sequence: str) -> CaptureErrors:
     """Errors of one capture after ``scene``."""
     paths = project.paths(sequence)
-    return scene_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
+    return capture_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
 
 
 def flat(evaluations: Sequence[Captures]) -> Figures:
     """Keys ``<dataset>.<measure>``."""
     found: Figures = {}
     for captured in evaluations:
-        figures = with_spread(scene_errors.figures, captured.errors)
+        figures = with_spread(capture_errors.figures, captured.errors)
         found |= keyed(f"{captured.dataset}.", figures)
     return found
 
@@ -64,7 +64,7 @@ def print_captures(evaluations: Sequence[Captures]) -> None:
         for name in found.missing:
             table.add_row(name, "no scene")
     console.print(table)
-    columns = [with_spread(scene_errors.figures, found.errors) for found in evaluations]
+    columns = [with_spread(capture_errors.figures, found.errors) for found in evaluations]
     names = [name for column in columns for name in column if not name.endswith(SPREAD)]
     table = ListTable("measure", *(found.dataset for found in evaluations))
     table.title = "all captures, after scene (+- standard error over captures)"

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.evaluate.field_errors import stated_displacement
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -27,19 +28,18 @@ from bench.evaluate.part import (
     with_spread,
 )
 from bench.evaluate.sequences import areas
-from intercap_core import artefacts
-from intercap_core.artefacts import Artefact
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.evaluation.field_errors import stated_displacement
-from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.scene_errors import displacement
-from intercap_core.evaluation.start_windows import (
+from bench.evaluate.start_windows import (
     Recording,
     WindowErrors,
     measure_windows,
     window_figures,
 )
+from intercap_core import artefacts
+from intercap_core.artefacts import Artefact
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.commands.console import ListTable, standard_console
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.truth import match_times
 from intercap_core.evaluation.verdict.figures import TRUE, StatedError, stated_errors
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup

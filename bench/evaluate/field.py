@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bench.evaluate import field_errors
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -30,7 +31,7 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.evaluation import field_errors, figures
+from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import TRUE, stated_errors, verdict_figures
 from intercap_core.project import Project

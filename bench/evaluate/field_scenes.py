@@ -11,6 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.evaluate import field_errors
+from bench.evaluate.faulty_rigs import name_faults
+from bench.evaluate.field_errors import FieldScene
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -20,11 +23,8 @@ from bench.evaluate.part import (
     number,
     truth_of,
 )
+from bench.evaluate.start_windows import Recording, measure_windows, window_figures
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.evaluation import field_errors
-from intercap_core.evaluation.faulty_rigs import name_faults
-from intercap_core.evaluation.field_errors import FieldScene
-from intercap_core.evaluation.start_windows import Recording, measure_windows, window_figures
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.evaluate import track_errors
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -46,7 +47,7 @@ def measure(project: Project, sequence: str) -> ObjectErrors:
     mesh = ObjectMesh.load(entry)
     paths = project.paths(sequence)
     truth = truth_of(project, sequence)
-    return object_errors.measure(paths.scene, paths.object_track, truth, mesh)
+    return track_errors.measure(paths.scene, paths.object_track, truth, mesh)
 
 
 def by_object(errors: Sequence[ObjectErrors]) -> dict[str, list[ObjectErrors]]:
@@ -67,7 +68,7 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
         for group, errors in {"": tracked.errors, **by_object(tracked.errors)}.items():
             figures = with_spread(object_errors.figures, errors)
             found |= keyed(f"{AREA}.{group}{'.' if group else ''}{start}", figures)
-        for views, figures in object_errors.by_views(tracked.errors).items():
+        for views, figures in track_errors.by_views(tracked.errors).items():
             found |= keyed(f"{AREA}.{start}views_{views.replace('-', '_to_')}.", figures)
     drawn = lost_by_draw(evaluations)
     spreads = {name: max(shares) - min(shares) for name, shares in drawn.items()}
@@ -104,7 +105,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
             table.add_row(f"{name}: no track")
         console.print(table)
         table = ListTable("views that see it", "frames", "mm", "deg", "lost")
-        for name, figures in object_errors.by_views(found.errors).items():
+        for name, figures in track_errors.by_views(found.errors).items():
             digits = (0, 1, 2, 3)
             table.add_row(
                 name, *(number(v, d) for v, d in zip(figures.values(), digits, strict=True))

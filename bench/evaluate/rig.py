@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.evaluate.board_recording import write_board_recording
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -33,7 +34,6 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
-from intercap_core.studio.board import write_board_recording
 from intercap_core.studio.stage import StudioStage
 
 BOARD = "charuco:6x4:0.15:0.115:4X4_50"  # 0.9 by 0.6 m

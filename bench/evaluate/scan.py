@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from bench.evaluate import track_errors
 from bench.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -29,7 +30,6 @@ from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.scan import scan
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.scan_errors import (
     Mesh,
     ScanErrors,
@@ -125,7 +125,7 @@ def _track_errors(
             object_=entry.model_copy(update={"mesh": file, "contact_vertices": None}),
             settings=project.config.object_track,
         )
-        found = object_errors.measure(paths.scene, output, truth_of(project, sequence), mesh)
+        found = track_errors.measure(paths.scene, output, truth_of(project, sequence), mesh)
         assert found.mssd is not None
         errors.append(found.mssd * mesh.diameter)
     return TrackErrors(sequence, *errors)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.evaluate import sequence_figures
 from bench.evaluate.part import (
     SPREAD,
     EvaluationPart,
@@ -17,12 +18,12 @@ from bench.evaluate.part import (
     truth_of,
     with_spread,
 )
+from bench.evaluate.through_wall import count_behind_wall
 from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.evaluation import contact_figures, figures
+from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.at_truth import displacements
 from intercap_core.evaluation.physics.figures import physics_figures
-from intercap_core.evaluation.through_wall import count_behind_wall
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
@@ -103,13 +104,13 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     """All figures of a group of sequences by area: the stages, and areas common to all stages."""
     known = [s for s in sequences if s.has_truth]
     found = {
-        stage: figures.truth_figures(sequences, stage) | contact_figures.hold_figures(known, stage)
+        stage: figures.truth_figures(sequences, stage) | sequence_figures.hold_figures(known, stage)
         for stage in ESTIMATES
     }
     for stage in ESTIMATES:
         sweep = figures.contact_sweep(sequences, stage)
         found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
-    found["joint"] |= contact_figures.stated_contact_figures(known) | _extra_joint_figures(
+    found["joint"] |= sequence_figures.stated_contact_figures(known) | _extra_joint_figures(
         known, found
     )
     penetration = figures.penetration_figures(sequences)
@@ -134,14 +135,14 @@ def _extra_joint_figures(sequences: Sequence[SequenceMetrics], found: Areas) -> 
     first = found["body_fit"]
     extra = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
     if any(s.object_ for s in sequences):
-        worse = contact_figures.worse_objects(sequences)
+        worse = sequence_figures.worse_objects(sequences)
         extra |= {"object_worse_count": float(len(worse))}
     cameras = figures.extrinsics_figures(sequences)
     if "joint_mean_mm" in cameras:
         extra["extrinsics_mm"] = cameras["joint_mean_mm"]
         extra["extrinsics_scene_mm"] = cameras["after_mean_mm"]
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
-        slips = contact_figures.slip_by_object(sequences, stage)
+        slips = sequence_figures.slip_by_object(sequences, stage)
         extra |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
     for name, some in _by_object(sequences).items():
         turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")

@@ -14,10 +14,11 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import sides_of
 from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import ranges, runs
+from intercap_core.evaluation.flags import ranges
 from intercap_core.flags import Flags
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.person.sides import images_with_stated_sides
 from intercap_core.schemas import FRAMES, JOINT, PERSON, SCENE
 

@@ -20,7 +20,7 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import runs
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
 _MAX_BYTES = 1 << 22

@@ -17,11 +17,12 @@ from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import ranges, runs
+from intercap_core.evaluation.flags import ranges
 from intercap_core.flags import Flags
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.output.viewer import page as page_of
 from intercap_core.output.viewer.content import gather
 from intercap_core.output.viewer.page import payload, unpacked

@@ -13,8 +13,9 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import exchanged, runs
+from intercap_core.evaluation.flags import exchanged
 from intercap_core.formats.detections.read import Detections
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.output.viewer.page import payload
 from intercap_core.person.left_right import excess_build_cost
 from intercap_core.person.sides import ARMS, LEGS, images_with_stated_sides, swap_sides

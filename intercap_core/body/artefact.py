@@ -18,9 +18,9 @@ from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
 
-# Cache of bodies by file and digest, numbers of betas and expression coefficients, and device. An
+# Cache of bodies by file and digest, and numbers of betas and expression coefficients. An
 # entry lives as long as the body is referenced, so a stage that reads several artefacts loads once.
-_LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
+_LOADED: WeakValueDictionary[tuple[str, int, int], BodyModel] = WeakValueDictionary()
 
 
 def file_digest(path: Path) -> str:
@@ -63,9 +63,7 @@ def put_parameters(
     writer.put("joints", joints)
 
 
-def load_model(
-    body_models: BodyModels, gender: str, artefact: Artefact, *, device: torch.device | str = "cpu"
-) -> BodyModel:
+def load_model(body_models: BodyModels, gender: str, artefact: Artefact) -> BodyModel:
     """Load the body that a body_fit or joint artefact was fitted with.
 
     Raises UserError if the body file is damaged or the settings name another file.
@@ -73,12 +71,10 @@ def load_model(
     path = body_models.of(gender) or OPEN_BODY
     digest = file_digest(path) if path.is_file() else ""
     betas, expression = artefact["betas"].shape[-1], artefact["expression"].shape[-1]
-    key = (f"{path} {digest}", betas, expression, str(device))
+    key = (f"{path} {digest}", betas, expression)
     model = _LOADED.get(key)
     if model is None:
-        _LOADED[key] = model = BodyModel.load(
-            path, num_betas=betas, num_expression=expression, device=device
-        )
+        _LOADED[key] = model = BodyModel.load(path, num_betas=betas, num_expression=expression)
     attributes = artefact.attributes
     if digest != attributes["body_model"]:
         raise UserError(

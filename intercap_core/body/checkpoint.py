@@ -77,7 +77,10 @@ def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
     """
     size = check_file(path, MAX_FILE_BYTES, advice=advice)
     try:
-        unpacked = _unpacked_bytes(path)
+        unpacked = 0  # of the format before PyTorch 1.6, which is no zip
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > size:  # torch.save does not compress
             words = f"unpacks from {size / 1e6:.1f} MB to {unpacked / 1e6:.0f} MB, expected no more"
             raise UnreadableFile(path, words, advice)
@@ -118,14 +121,6 @@ def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str |
     if float(value.abs().max()) > largest:
         return f"weights up to {float(value.abs().max()):.3g}, expected at most {largest:g}"
     return None
-
-
-def _unpacked_bytes(path: Path) -> int:
-    """Size of the files in a checkpoint; 0 for the format before PyTorch 1.6, which is no zip."""
-    if not zipfile.is_zipfile(path):
-        return 0
-    with zipfile.ZipFile(path) as archive:
-        return sum(entry.file_size for entry in archive.infolist())
 
 
 def _read(path: Path) -> Any:

@@ -20,12 +20,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
-from intercap_core.body.kinematics import (
-    PosedJoints,
-    joint_shape_derivatives,
-    left_jacobian,
-    skew,
-)
+from intercap_core.body.kinematics import PosedJoints, joint_shape_derivatives, left_jacobian, skew
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body.selection import Selection
 

@@ -180,8 +180,7 @@ def find_regions(
         pad = np.where(thumb[:, None], across, down)
         claim(f"{side}_hand", hand & past_wrist & ((normals * pad).sum(1) > 0.15))
         claim(
-            f"{side}_foot",
-            (share(f"{side}_ankle", f"{side}_foot") > 0.5) & (normals[:, 1] < -0.5),
+            f"{side}_foot", (share(f"{side}_ankle", f"{side}_foot") > 0.5) & (normals[:, 1] < -0.5)
         )
     seat_low, seat_high = hip_y - 0.32 * thigh_length, hip_y + 0.18 * thigh_length
     legs = share("pelvis", "left_hip", "right_hip")

@@ -18,12 +18,7 @@ from torch import Tensor
 
 from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
 from intercap_core.body.keypoints import KeypointMap
-from intercap_core.body.kinematics import (
-    PosedJoints,
-    pose_joints,
-    rotation_from_axis_angle,
-    skin,
-)
+from intercap_core.body.kinematics import PosedJoints, pose_joints, rotation_from_axis_angle, skin
 from intercap_core.body.loading import BodyArrays, load_body_file
 from intercap_core.body.maps import find_regions, load_maps
 from intercap_core.body.parameters import TRANSL, BodyParameters
@@ -249,7 +244,8 @@ def check_body(model: BodyModel) -> None:
     low, high = template.amin(0), template.amax(0)
     width = float((high - low).amax())
     beyond = float(torch.maximum(low - joints, joints - high).amax())
-    area = _area(template, model.faces)
+    a, b, c = (template[model.faces[:, i]] for i in range(3))
+    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
     # share of the skin's width (x) and height (y) that the joints span, the smaller one
     span = float(((joints.amax(0) - joints.amin(0)) / (high - low))[:2].amin())
     weight = float(model.skinning_weights.amin())
@@ -278,12 +274,6 @@ def check_body(model: BodyModel) -> None:
     for wrong, words in problems:
         if wrong:
             raise UserError(f"Body file {model.path} has {words}: {_HINT}.")
-
-
-def _area(points: Tensor, faces: Tensor) -> float:
-    """Return the area of the skin, square metres."""
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
 
 
 def _largest_move(model: BodyModel) -> float:

@@ -89,6 +89,5 @@ class BodyParameters:
         """Return the chosen frames; fields of one row are expanded to the batch first."""
         batch = self.batch
         return replace(
-            self,
-            **{f.name: getattr(self, f.name).expand(batch, -1)[index] for f in fields(self)},
+            self, **{f.name: getattr(self, f.name).expand(batch, -1)[index] for f in fields(self)}
         )

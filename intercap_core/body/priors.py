@@ -192,12 +192,7 @@ def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
 
 
 def hand_pose(
-    vector: Tensor,
-    mean: Tensor,
-    components: Tensor,
-    deviation: Tensor,
-    *,
-    side: int,
+    vector: Tensor, mean: Tensor, components: Tensor, deviation: Tensor, *, side: int
 ) -> LinearRows:
     """E_theta_h: Gaussian over one hand's pose components, r = C (theta - mean) / deviation.
 

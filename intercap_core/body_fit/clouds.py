@@ -53,7 +53,7 @@ class PersonCloud:
     def __reduce__(self) -> tuple[Any, ...]:
         # arrays are pickled faster than tensors
         arrays = [values.numpy() for values in (self.points, self.normals, self.trust, self.view)]
-        return _cloud_of_arrays, (*arrays, self.windows, self.outlines)
+        return _cloud_of_arrays, (arrays, self.windows, self.outlines)
 
     def of_view(self, view: int) -> PersonCloud:
         """Return the part of camera ``view``."""
@@ -91,15 +91,10 @@ class PersonCloud:
 
 
 def _cloud_of_arrays(
-    points: np.ndarray,
-    normals: np.ndarray,
-    trust: np.ndarray,
-    view: np.ndarray,
-    windows: tuple[DepthWindow, ...],
-    outlines: tuple[MaskRim, ...],
+    arrays: list[np.ndarray], windows: tuple[DepthWindow, ...], outlines: tuple[MaskRim, ...]
 ) -> PersonCloud:
-    of = torch.from_numpy
-    return PersonCloud(of(points), of(normals), of(trust), of(view), windows, outlines)
+    points, normals, trust, view = map(torch.from_numpy, arrays)
+    return PersonCloud(points, normals, trust, view, windows, outlines)
 
 
 class _Masks(NamedTuple):

@@ -9,20 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.keypoints import (
-    BODY,
-    CONTOUR,
-    FACE,
-    LEFT_HAND,
-    NUM_KEYPOINTS,
-    RIGHT_HAND,
-)
+from intercap_core.body.keypoints import BODY, CONTOUR, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import cloud_term, keypoint_term
 from intercap_core.body_fit.clouds import PersonCloud
@@ -36,13 +28,9 @@ from intercap_core.body_fit.self_contact import (
     join_frames,
     no_contacts,
 )
-from intercap_core.body_fit.surface import (
-    COVERINGS,
-    SAMPLE_SHARE,
-    SkinSurface,
-    choose_samples,
-)
+from intercap_core.body_fit.surface import COVERINGS, SkinSurface, choose_samples
 from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Views, keypoint_set
+from intercap_core.body_fit.view_distances import ViewDistances
 from intercap_core.disk import DiskList
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.levenberg_marquardt import BLOCK_FRAMES
@@ -62,37 +50,6 @@ KEYPOINT_SIGMA_M = (
 # Factor of sigma for errors that persist over frames: the fit absorbs them, so residuals do not
 # show them. Tuned on the studio.
 PERSISTENCE = 1.5
-_LEAST_CONFIDENCE = 0.1  # confidence below which sigma no longer grows; tuned on the studio
-
-
-def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
-    """Fit errors (M,) by a multiple of confidence^-a, confidence (M,), and return a.
-
-    -a is the slope of log median error over log median confidence, in six bins of confidence. a is
-    limited to 0 to 2, and 0 if a bin has less than 30 errors. Tuned on the studio.
-    """
-    bins = torch.tensor_split(confidence.argsort(), 6)
-    if len(bins[0]) < 30:
-        return 0.0
-    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
-    y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
-    x, y = x - x.mean(), y - y.mean()
-    slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
-    return min(max(slope, 0.0), 2.0)
-
-
-class ViewDistances(NamedTuple):
-    """Measurements at S samples of the skin, by camera, in N frames."""
-
-    distance: Tensor
-    """(N, C, S) mean signed distance of the matched points from the skin, outside positive,
-    metres."""
-    points: Tensor
-    """(N, C, S) effective number of matched points, 0 = none."""
-    where: Tensor
-    """(N, S, 3) position of the samples."""
-    normal: Tensor
-    """(N, S, 3) normal of the samples."""
 
 
 class Evidence:
@@ -172,15 +129,8 @@ class Evidence:
         ]
         self.observations = replace(observations, rig=rig, depth_bias=depth_bias)
 
-    # --- keypoints ---------------------------------------------------------------------------
-
     def observe_keypoints(
-        self,
-        problem: BodyProblem,
-        *,
-        hands: bool = False,
-        face: bool = False,
-        widened: float = 1.0,
+        self, problem: BodyProblem, *, hands: bool = False, face: bool = False, widened: float = 1.0
     ) -> None:
         """Set the problem's keypoints and views (:class:`.term_inputs.Views`) at its bodies.
 
@@ -273,7 +223,7 @@ class Evidence:
 
         It is (confidence / median confidence)^-a, see `keypoint_doubt`.
         """
-        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.median_confidence[index]
+        share = confidence.clamp_min(keypoint_term.LEAST_CONFIDENCE) / self.median_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
@@ -294,13 +244,12 @@ class Evidence:
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
                 confidence, errors = views.confidence[:, :, here][known], scaled[:, :, here][known]
-                self.keypoint_doubt[part] = fit_confidence_exponent(confidence, errors.mean(1))
+                doubt = keypoint_term.fit_confidence_exponent(confidence, errors.mean(1))
+                self.keypoint_doubt[part] = doubt
                 factor = self._sigma_factor(views.confidence, index)[:, :, here][known]
                 at_median = errors / factor[:, None]
                 estimate = SIGMA_PER_MAD * PERSISTENCE * float(at_median.median())
                 self.keypoint_sigma[part] = min(max(estimate, start * 0.1), start * 4.0)
-
-    # --- cloud -------------------------------------------------------------------------------
 
     def refine_cloud_noise(self, problem: BodyProblem) -> None:
         """Estimate the noise of each covering from the median absolute residual of its samples.
@@ -365,7 +314,7 @@ class Evidence:
             found = self._observe_block(
                 problem, at, reach, only, contacts if pairs else None, depth_points_only
             )
-            for whole, part in zip(rows, self._rows(found, found.points), strict=True):
+            for whole, part in zip(rows, self.rows(found, found.points), strict=True):
                 whole[at] = part
             if kept is not None:
                 for whole, part in zip(kept, found, strict=True):
@@ -442,25 +391,10 @@ class Evidence:
         own = at - around.start
         return where[own], None if shift is None else shift[own]
 
-    def rows(self, points: Tensor) -> CloudRows:
-        """Return the rows of E_D of ``by_view``, averaged over cameras.
-
-        points (N, C, S): effective number of points, which weights each camera's distance. Samples
-        with 0 points in all cameras have no weight.
-        """
-        assert self.by_view is not None, "observe the skin first"
-        return self._rows(self.by_view, points)
-
-    def _rows(self, by_view: ViewDistances, points: Tensor) -> CloudRows:
-        """As :meth:`rows`, of other measurements."""
-        total = points.sum(1)
-        mean = (by_view.distance * points).sum(1) / total.clamp_min(1e-6)
+    def rows(self, by_view: ViewDistances, points: Tensor) -> CloudRows:
+        """Return the rows of E_D of ``by_view``; points (N, C, S): effective number of points."""
         noise = self.cloud_noise[self.group]
-        share = self.cloud_weight * SAMPLE_SHARE
-        # with two points a sample has half its weight; tuned on the studio
-        weight = share * total / (total + 2.0) / noise**2
-        target = mean + (by_view.normal * by_view.where).sum(2)
-        return CloudRows(target, by_view.normal, weight)
+        return by_view.rows(noise, self.cloud_weight, points)
 
 
 def _blocks(count: int) -> list[slice]:

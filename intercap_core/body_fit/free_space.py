@@ -46,11 +46,7 @@ class DepthWindow:
 
 
 def find_protruding(
-    window: DepthWindow,
-    camera: Camera,
-    depth_bias: float,
-    points: np.ndarray,
-    normals: np.ndarray,
+    window: DepthWindow, camera: Camera, depth_bias: float, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find points that protrude from the person in one view.
 

@@ -44,6 +44,24 @@ from intercap_core.body_fit.term_inputs import (
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
 
+LEAST_CONFIDENCE = 0.1  # confidence below which sigma no longer grows; tuned on the studio
+
+
+def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
+    """Fit errors (M,) by a multiple of confidence^-a, confidence (M,), and return a.
+
+    -a is the slope of log median error over log median confidence, in six bins of confidence. a is
+    limited to 0 to 2, and 0 if a bin has less than 30 errors. Tuned on the studio.
+    """
+    bins = torch.tensor_split(confidence.argsort(), 6)
+    if len(bins[0]) < 30:
+        return 0.0
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(LEAST_CONFIDENCE).log()
+    y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
+    x, y = x - x.mean(), y - y.mean()
+    slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
+    return min(max(slope, 0.0), 2.0)
+
 
 class Keypoints(NamedTuple):
     """K keypoints of B bodies and their derivatives by n parameters."""

@@ -121,9 +121,7 @@ def compare_parts(
     """
     size = (len(whitened), len(BODY_PARTS))
     unknown, none = whitened.new_full(size, torch.nan), whitened.new_zeros(size)
-    result = PartEvidence(
-        unknown, unknown.clone(), none, none.clone(), none.clone(), none + 1
-    )  # fmt: skip
+    result = PartEvidence(unknown, unknown.clone(), none, none.clone(), none.clone(), none + 1)
     square = whitened.clamp(max=OUTLIER_SIGMAS) ** 2 / 2
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):

@@ -235,7 +235,7 @@ class Fitter:
         self._linearise_pose_prior(problem)
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
-    def observe_only(self, problem: BodyProblem, view: np.ndarray | None = None) -> None:
+    def observe_only(self, problem: BodyProblem, view: np.ndarray | None) -> None:
         """Update correspondences and body keypoints only.
 
         view (N,): index of the camera whose measurements are used in each frame; None = the depth

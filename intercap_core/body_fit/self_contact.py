@@ -94,7 +94,11 @@ class SelfContact(NamedTuple):
         template = model.template.double().numpy()
         faces = model.faces.numpy()
         part = _PART_OF_JOINT[model.skinning_weights.argmax(1).numpy()]
-        thickness = _thickness(template, faces, samples.vertex)
+        normals = vertex_normals(template, faces)[samples.vertex]
+        start = template[samples.vertex] - 1e-3 * normals
+        surface = SurfaceTree(template, faces).shaped(template)
+        # thickness of the body at each vertex along its normal, metres
+        thickness = BODY_LENGTH_M * surface.first_hit(start, start - BODY_LENGTH_M * normals)
         own = part[samples.vertex]
         # Smallest geodesic distance of samples that are compared, over the mean thickness of their
         # parts. It is larger at a hinge, where flesh touches when it closes. Tuned on the studio.
@@ -119,14 +123,6 @@ class SelfContact(NamedTuple):
             deepest=np.minimum(0.5 * thickness, 0.06).astype(dtype),
             sideways=spacing.astype(dtype),
         )
-
-
-def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
-    """Return the thickness (N,) of the body at each vertex along its normal, metres."""
-    normals = vertex_normals(points, faces)[vertex]
-    start = points[vertex] - 1e-3 * normals
-    surface = SurfaceTree(points, faces).shaped(points)
-    return BODY_LENGTH_M * surface.first_hit(start, start - BODY_LENGTH_M * normals)
 
 
 def _geodesic_distances(

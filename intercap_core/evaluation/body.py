@@ -5,25 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS, JOINT_INDEX
-from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
 
 
 def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:
     """Per-vertex error (PVE) (...): mean distance of corresponding vertices (..., V, 3)."""
     return np.linalg.norm(vertices - true_vertices, axis=-1).mean(-1)
-
-
-def visible_vertex_error(
-    vertices: np.ndarray,
-    true_vertices: np.ndarray,
-    visible: np.ndarray,
-) -> np.ndarray:
-    """Mean vertex error (...) over the mask ``visible`` (..., V); NaN if the mask is empty."""
-    error = np.linalg.norm(vertices - true_vertices, axis=-1)
-    count = visible.sum(-1)
-    mean = (error * visible).sum(-1) / np.maximum(count, 1)
-    return np.where(count > 0, mean, np.nan)
 
 
 def joint_error(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
@@ -34,31 +21,6 @@ def joint_error(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
 def joint_errors(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
     """Distance (..., 22) of each body joint of (..., 55, 3) from the true joint."""
     return np.linalg.norm(joints - true_joints, axis=-1)[..., BODY_JOINTS]
-
-
-def landmarks(vertices: np.ndarray, keypoints: KeypointMap) -> np.ndarray:
-    """Face landmarks (..., 68, 3) of vertices (..., V, 3): 51 inner ones, then the jaw line."""
-    ids, weights = (
-        np.concatenate([of[FACE], of[CONTOUR]]) for of in (keypoints.ids, keypoints.weights)
-    )
-    return (vertices[..., ids, :] * weights[..., None]).sum(-2)
-
-
-def landmark_error(found: np.ndarray, true: np.ndarray, *, align: bool = False) -> np.ndarray:
-    """Mean distance (...) of corresponding points (..., N, 3).
-
-    ``align`` first applies the rigid transform that best maps the found onto the true points
-    (Kabsch 1976). The remaining error is that of shape and expression, without the head's pose.
-    """
-    if align:
-        middle = true.mean(-2, keepdims=True)
-        centred = found - found.mean(-2, keepdims=True)
-        u, _, vt = np.linalg.svd(np.swapaxes(true - middle, -1, -2) @ centred)
-        flip = np.ones(u.shape[:-1])
-        flip[..., 2] = np.sign(np.linalg.det(u @ vt))
-        rotation = (u * flip[..., None, :]) @ vt
-        found = centred @ np.swapaxes(rotation, -1, -2) + middle
-    return np.linalg.norm(found - true, axis=-1).mean(-1)
 
 
 def hand_error(
@@ -89,10 +51,7 @@ def hand_error(
 
 
 def corresponding_vertices(
-    true_vertices: np.ndarray,
-    true_faces: np.ndarray,
-    face: np.ndarray,
-    weights: np.ndarray,
+    true_vertices: np.ndarray, true_faces: np.ndarray, face: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Points (..., V, 3) of the true surface that correspond to the vertices of the fitted mesh.
 
@@ -110,10 +69,7 @@ def corresponding_vertices(
 
 
 def normalised_joint_error(
-    joints: np.ndarray,
-    true_joints: np.ndarray,
-    sigma: np.ndarray,
-    which: slice = BODY_JOINTS,
+    joints: np.ndarray, true_joints: np.ndarray, sigma: np.ndarray, which: slice = BODY_JOINTS
 ) -> np.ndarray:
     """Distance (..., J) of joints from the truth over the distance expected from ``sigma``.
 

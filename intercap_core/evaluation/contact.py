@@ -34,9 +34,7 @@ def vertex_contact(facing_distance: np.ndarray, threshold_m: float = CONTACT_M) 
 
 
 def region_contact(
-    vertex: np.ndarray,
-    regions: Mapping[str, np.ndarray],
-    names: Sequence[str],
+    vertex: np.ndarray, regions: Mapping[str, np.ndarray], names: Sequence[str]
 ) -> np.ndarray:
     """Mask (..., R) of the regions in which at least one vertex is in contact.
 

@@ -103,6 +103,11 @@ def pooled_flags(sequences: Sequence[SequenceMetrics]) -> Flags:
     return Flags(flagged, [reason for s in sequences for reason in s.flags.reasons])
 
 
+def finite(figures: Figures) -> Figures:
+    """The figures that are known."""
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
 def finite_median(values: np.ndarray) -> float:
     """Median of the finite values; NaN if there is none."""
     known = values[np.isfinite(values)]
@@ -132,8 +137,7 @@ def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """The figures of :func:`cloud_figures` for the true poses (lower bounds); empty without
     truth."""
-    figures = _cloud_distances(sequences, "truth/{}_floor")
-    return {name: value for name, value in figures.items() if np.isfinite(value)}
+    return finite(_cloud_distances(sequences, "truth/{}_floor"))
 
 
 def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
@@ -164,7 +168,7 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     }
     body = figures["acceleration_body_mm"]
     figures["acceleration_error"] = body if np.isfinite(body) else figures["acceleration_object_mm"]
-    return {key: value for key, value in figures.items() if np.isfinite(value)}
+    return finite(figures)
 
 
 def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
@@ -238,9 +242,7 @@ def contact_sweep(sequences: Sequence[SequenceMetrics], stage: str) -> dict[floa
 
 
 def _over(
-    sequences: Sequence[SequenceMetrics],
-    key: str,
-    how: Callable[[np.ndarray], Any],
+    sequences: Sequence[SequenceMetrics], key: str, how: Callable[[np.ndarray], Any]
 ) -> float:
     """Apply ``how`` to dataset ``key`` over all frames; NaN if it is unknown everywhere."""
     values = pooled(sequences, key)

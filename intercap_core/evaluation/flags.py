@@ -22,16 +22,8 @@ def ranges(reasons: Sequence[str]) -> list[tuple[int, int, str]]:
     return runs
 
 
-def runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First and last frame of each run of set frames (T,)."""
-    return [(first, last) for first, last, _ in ranges(["x" if on else "" for on in mask])]
-
-
 _SIDES = ("left", "right")
-_LIMBS = {
-    "legs": ("knee", "ankle", "foot"),
-    "arms": ("elbow", "wrist"),
-}
+_LIMBS = {"legs": ("knee", "ankle", "foot"), "arms": ("elbow", "wrist")}
 
 
 def exchanged(joints: np.ndarray) -> dict[str, np.ndarray]:

@@ -30,7 +30,12 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.facing import facing_distance
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
-from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface, vertex_normals
+from intercap_core.geometry.rigid.surfaces import (
+    doubled_areas,
+    face_normals,
+    sample_surface,
+    vertex_normals,
+)
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS, PER_VERTEX_METRICS
 
@@ -48,23 +53,13 @@ class HandledObject:
     def __init__(self, mesh: ObjectMesh, track: ObjectTrack) -> None:
         self.mesh, self.track = mesh, track
         self.surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-        area = np.linalg.norm(
-            np.cross(
-                mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]],
-                mesh.vertices[mesh.faces[:, 2]] - mesh.vertices[mesh.faces[:, 0]],
-            ),
-            axis=1,
-        ).sum()
-        # ``area`` is twice the surface; 500 to 20000 samples
-        count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, 20000))
+        area = doubled_areas(mesh.vertices, mesh.faces).sum() / 2
+        count = int(np.clip(area / SAMPLE_SPACING_M**2, 500, 20000))
         contact_samples = sample_surface(mesh.vertices, mesh.faces, count)
         self.points = contact_samples.of(mesh.vertices, mesh.faces)
         # of the points, then of the vertices; an open surface is touched from both sides
         self.normals = float(mesh.watertight) * np.concatenate(
-            [
-                mesh.face_normals[contact_samples.faces],
-                vertex_normals(mesh.vertices, mesh.faces),
-            ]
+            [mesh.face_normals[contact_samples.faces], vertex_normals(mesh.vertices, mesh.faces)]
         )
         self.samples = sample_surface(mesh.vertices, mesh.faces, 2000)
         self.sample_points = self.samples.of(mesh.vertices, mesh.faces)

@@ -15,22 +15,17 @@ import numpy as np
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 
-def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
-    """x[t+1] - 2 x[t] + x[t-1] of (T, ..., 3), metres per frame^2 at 30 fps; NaN at both ends.
+def acceleration(positions: np.ndarray, fps: float) -> np.ndarray:
+    """Mean length (T,) of the second differences x[t+1] - 2 x[t] + x[t-1] of N points (T, N, 3).
 
-    A second difference grows with the square of the frame's duration. The one at ``fps`` is
-    therefore multiplied by (fps / 30)^2, which gives that of 30 fps.
+    NaN at both ends. The unit is metres per frame^2 at 30 fps: a second difference grows with the
+    square of the frame's duration, so the one at ``fps`` is multiplied by (fps / 30)^2.
     """
-    result = np.full(positions.shape, np.nan)
+    change = np.full(positions.shape, np.nan)
     if len(positions) > 2:
         middle = positions[2:] - 2 * positions[1:-1] + positions[:-2]
-        result[1:-1] = middle * (fps / 30.0) ** 2
-    return result
-
-
-def acceleration(positions: np.ndarray, fps: float) -> np.ndarray:
-    """Mean length (T,) of the second differences of N points (T, N, 3), metres per frame^2."""
-    return np.linalg.norm(second_difference(positions, fps), axis=-1).mean(-1)
+        change[1:-1] = middle * (fps / 30.0) ** 2
+    return np.linalg.norm(change, axis=-1).mean(-1)
 
 
 def acceleration_error(positions: np.ndarray, true: np.ndarray, fps: float) -> np.ndarray:
@@ -87,10 +82,7 @@ def turns(rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGro
 
 
 def motion_onset_lags(
-    centre: np.ndarray,
-    true_centre: np.ndarray,
-    is_moving: np.ndarray,
-    fps: float,
+    centre: np.ndarray, true_centre: np.ndarray, is_moving: np.ndarray, fps: float
 ) -> list[float]:
     """Delay of the track, in frames, each time the true object starts to move; negative = early.
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import rotation_log
-from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import MEDIAN_CHI_3
 
 # A pose with a larger error of either kind is lost (docs/evaluation.md).
@@ -27,9 +25,7 @@ def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) ->
 
 
 def first_seen_found(
-    translation_error_m: np.ndarray,
-    rotation_error_degrees: np.ndarray,
-    views: np.ndarray,
+    translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray, views: np.ndarray
 ) -> bool | None:
     """Whether the error is below 20 mm and 10 degrees in the first frame that shows the object.
 
@@ -47,9 +43,7 @@ def first_seen_found(
 
 
 def normalised_translation_error(
-    translation: np.ndarray,
-    true_translation: np.ndarray,
-    covariance: np.ndarray,
+    translation: np.ndarray, true_translation: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
     """Mahalanobis length (T,) of the translation error, divided by its expected median.
 
@@ -68,35 +62,3 @@ def normalised_translation_error(
     solved = np.linalg.solve(block[known], error[known][..., None])[..., 0]
     length[known] = np.sqrt(np.einsum("ti,ti->t", error[known], solved))
     return length / MEDIAN_CHI_3
-
-
-def normalised_rotation_error(
-    rotation: np.ndarray,
-    true_rotation: np.ndarray,
-    covariance: np.ndarray,
-    symmetry: SymmetryGroup,
-) -> np.ndarray:
-    """Mahalanobis length (T,) of the rotation error, divided by its expected median.
-
-    The error is that to the nearest equivalent true rotation. Principal axes with a stated
-    deviation above 30 degrees are undetermined and excluded; NaN if all are.
-
-    Args:
-        rotation, true_rotation: (T, 3, 3).
-        covariance: (T, 6, 6), see :func:`normalised_translation_error`.
-        symmetry: rotations that leave the object unchanged.
-    """
-    from scipy.stats import chi  # takes a second to import, which most processes do not need
-
-    truly = symmetry.nearest_equivalent(true_rotation, rotation)
-    error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))
-    result = np.full(len(error), np.nan)
-    for t, block in enumerate(covariance[:, :3, :3]):
-        if not np.isfinite(block).all():
-            continue
-        variance, axes = np.linalg.eigh(block)
-        known = (variance > 0) & (variance < np.radians(30.0) ** 2)
-        if known.any():
-            length = np.sqrt(((error[t] @ axes[:, known]) ** 2 / variance[known]).sum())
-            result[t] = length / chi(int(known.sum())).median()
-    return result

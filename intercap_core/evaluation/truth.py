@@ -128,9 +128,7 @@ class Truth:
             )
 
     def object_samples_visible(
-        self,
-        samples: SurfaceSamples,
-        mesh: ObjectMesh,
+        self, samples: SurfaceSamples, mesh: ObjectMesh
     ) -> tuple[np.ndarray, np.ndarray]:
         """True object vertices nearest to the tracked mesh's samples, and their visibility.
 
@@ -194,11 +192,7 @@ def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndar
 
 
 def object_errors(
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    track: ObjectTrack,
-    mesh: ObjectMesh,
-    fps: float,
+    rotation: np.ndarray, translation: np.ndarray, track: ObjectTrack, mesh: ObjectMesh, fps: float
 ) -> dict[str, np.ndarray]:
     """Errors of T object poses, by dataset of the metrics artefact without ``truth/<stage>/``.
 

@@ -17,11 +17,7 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.config import JointSettings
 from intercap_core.joint.assembly import Assembly, assemble
 from intercap_core.joint.cameras import CameraEvidence, CameraFit
-from intercap_core.joint.contact_estimate import (
-    AnnotatedContact,
-    ContactEstimate,
-    estimate_contact,
-)
+from intercap_core.joint.contact_estimate import AnnotatedContact, ContactEstimate, estimate_contact
 from intercap_core.joint.fit_flags import FrameFaults, fit_flags
 from intercap_core.joint.geometry import Geometry, PosedGeometry
 from intercap_core.joint.inputs import JointInputs

@@ -17,12 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from intercap_core.geometry.camera.transforms import apply_step, rigid, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.object_track.decoder import (
-    HELD_M_S,
-    HELD_RAD_S,
-    mode_log_ratios,
-    pose_distances,
-)
+from intercap_core.object_track.decoder import HELD_M_S, HELD_RAD_S, mode_log_ratios, pose_distances
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import UNSEEN_S
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
@@ -218,9 +213,15 @@ def _choose_path(observer: Observer, paths: list[Bridge]) -> tuple[Bridge, list[
     if len(paths) == 1:
         return paths[0], [], False
     fits = [_fit_path(observer, path) for path in paths]
+
+    def log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
+        """Images' log-likelihood ratio of a fit, less its deviation from the path."""
+        step = step_between(pose, fit.pose)
+        return fit.log_ratio - 0.5 * float(step @ information @ step)
+
     by_images = np.array(
         [
-            observer.share * sum(map(_path_log_ratio, path.poses, path.information, own))
+            observer.share * sum(map(log_ratio, path.poses, path.information, own))
             for path, own in zip(paths, fits, strict=True)
         ]
     )
@@ -229,16 +230,6 @@ def _choose_path(observer: Observer, paths: list[Bridge]) -> tuple[Bridge, list[
     different = [_is_different(observer.mesh, paths[best], path) for path in paths]
     lead = total[best] - max(total[different], default=-np.inf)
     return paths[best], fits[best], bool(lead > 2.0 and by_images[best] > CONTRADICTED_LOG_RATIO)
-
-
-def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
-    """Return the images' log-likelihood ratio of a fit, less its deviation from the path.
-
-    ``pose`` (4, 4) and ``information`` (6, 6) are those of the path. The straight path is not
-    fitted, so it has no deviation.
-    """
-    step = step_between(pose, fit.pose)
-    return fit.log_ratio - 0.5 * float(step @ information @ step)
 
 
 def _is_different(mesh: ObjectMesh, path: Bridge, other: Bridge) -> bool:

@@ -76,8 +76,9 @@ class ColourDecision:
         results = []
         for (k, colours), values in zip(known.items(), every, strict=True):
             again = decode_given(values, steps, first, k, self._absent)
-            evidence = again.evidence + self._paint_log_ratio(colours)
-            results.append(replace(again, evidence=evidence))
+            # wrong colours are wrong in all frames, so all frames count as three observations
+            paint = 3 * float(np.mean([colours.paint_log_ratio(s) for s in colours.sightings]))
+            results.append(replace(again, evidence=again.evidence + paint))
         return mix_decisions(results) if results else decoded
 
     def _ambiguous(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
@@ -112,13 +113,6 @@ class ColourDecision:
             return None
         views = len(self._observer.views(kept[0].frame))
         return Appearance(kept, views, self._observer.paint, self._patch_size)
-
-    def _paint_log_ratio(self, learnt: Appearance) -> float:
-        """Return the evidence of the mesh's own colours for the poses of the learnt frames, nats.
-
-        Wrong colours are wrong in all frames, so all frames count as three observations.
-        """
-        return 3 * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
 
     def _add_colours(
         self,

@@ -55,7 +55,7 @@ class ImageEvidence:
 
 
 def evidence_at(
-    context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None = None
+    context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray
 ) -> ImageEvidence:
     """Evaluate the evidence of the images at ``pose`` (4, 4) with the last robust scales of a fit.
 
@@ -76,9 +76,7 @@ def evidence_at(
     return ImageEvidence(depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], reports)
 
 
-def report_at(
-    context: FitContext, view: View, pose: np.ndarray, twist: np.ndarray | None = None
-) -> ViewReport:
+def report_at(context: FitContext, view: View, pose: np.ndarray, twist: np.ndarray) -> ViewReport:
     """Return the report of :func:`evidence_at` for one view and ``pose`` (4, 4)."""
     (fit,) = view_fits(context, [view], pose, twist)
     fit.choose()

@@ -25,6 +25,8 @@ from intercap_core.object_track.view_report import ViewReport, choose_candidate,
 # Geman-McClure scales, first and last, like those of contours: from the error of a start to a few
 # standard deviations of the noise.
 DEPTH_SCALES_M = (0.050, 0.012)  # metres; tuned
+AT_REST = np.zeros(6)  # motion of the object: turn and shift per second, rad and metres
+AT_REST.setflags(write=False)
 FIT_ROUNDS = (4, 5)  # at most this many Gauss-Newton steps after each choice of candidates; tuned
 
 
@@ -81,7 +83,7 @@ def fit_pose(
     prior: MotionPrior | None = None,
     rounds: tuple[int, ...] = FIT_ROUNDS,
     start_scale: float = 1.0,
-    twist: np.ndarray | None = None,
+    twist: np.ndarray = AT_REST,
 ) -> FittedPose:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
@@ -101,8 +103,8 @@ def fit_pose(
         rounds: Gauss-Newton steps at most. Before each round, every view chooses its candidate.
         start_scale: factor of the first robust scales; below 1 if the start is better than from a
             search.
-        twist: (6,) turn and shift of the object per second (rad, m), None = at rest. Each view sees
-            the object moved by the twist times its time offset.
+        twist: (6,) turn and shift of the object per second (rad, m). Each view sees the object
+            moved by the twist times its time offset.
     """
     pool = context.renderer.pool
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
@@ -139,7 +141,7 @@ def fit_pose(
                     fit.see(own, drawn)
     reports = pool.map(lambda fit: fit.report(), fits)
     covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
-    return FittedPose(pose, covariance, tuple(reports), np.zeros(6) if twist is None else twist)
+    return FittedPose(pose, covariance, tuple(reports), twist)
 
 
 def _step(
@@ -160,7 +162,9 @@ def _step(
         hessian += h
         gradient += g
     damped = hessian + np.diag(1e-3 * np.diag(hessian) + 1e-9)
-    return hessian, _limited(-np.linalg.solve(damped, gradient))
+    step = -np.linalg.solve(damped, gradient)
+    turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+    return hessian, step / max(1.0, turn / np.radians(20), shift / 0.06)  # limited, rad and metres
 
 
 def _is_below(step: np.ndarray, metres: float, radians: float) -> bool:
@@ -168,7 +172,7 @@ def _is_below(step: np.ndarray, metres: float, radians: float) -> bool:
 
 
 def view_fits(
-    context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None
+    context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray
 ) -> list[ViewFit]:
     """Create the fit of each view at ``pose`` (4, 4), moved by ``twist`` (6,) to its exposure."""
     seen = seen_by(pose, views, twist)
@@ -226,20 +230,12 @@ def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarra
     return np.diag(weight), weight * away
 
 
-def _limited(step: np.ndarray) -> np.ndarray:
-    """Shorten a step (6,) to at most 20 degrees and 6 cm."""
-    turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
-    return step / max(1.0, turn / np.radians(20), shift / 0.06)
-
-
-def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
+def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray) -> list[np.ndarray]:
     """Return the pose (4, 4) at the exposure of each view.
 
     ``twist`` (6,) is the motion of the object per second. If the object moves by less than 0.4 mm
     and 0.08 degrees until a view exposes, the view gets the array ``pose`` itself.
     """
-    if twist is None:
-        return [pose] * len(views)
     steps = np.array([view.geometry.time_offset_s for view in views])[:, None] * twist
     moves = np.abs(steps[:, :3]).max(1) > np.radians(0.08)
     moves |= np.abs(steps[:, 3:]).max(1) > 4e-4

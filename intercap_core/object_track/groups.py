@@ -30,12 +30,8 @@ OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sam
 LOCATED_MIN_POINTS = 15  # of a candidate's point cloud, or pixels of its mask; tuned on the studio
 
 
-def _unit_circle(count: int) -> np.ndarray:
-    angles = 2 * np.pi * np.arange(count) / count
-    return np.stack([np.cos(angles), np.sin(angles)], 1)
-
-
-_COMPASS = _unit_circle(OUTLINE_DIRECTIONS)
+_ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS
+_COMPASS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
 """(D, 2) unit vectors of the image directions."""
 
 

@@ -12,12 +12,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.object_track.decoder import (
-    HIDDEN,
-    JUMP_COST,
-    Decoded,
-    pose_distances,
-)
+from intercap_core.object_track.decoder import HIDDEN, JUMP_COST, Decoded, pose_distances
 from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import UNSEEN_S, GivenPose
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO

@@ -15,7 +15,7 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.geometry.rigid.render import open_renderer
 from intercap_core.object_track.evidence import ERROR_LASTING_S, ImageEvidence, evidence_at
-from intercap_core.object_track.fit import FittedPose, MotionPrior, assess_all, fit_pose
+from intercap_core.object_track.fit import AT_REST, FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.motion import carry_in_hands
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.recording import ViewCache
@@ -148,7 +148,7 @@ class Observer:
         prior: MotionPrior | None,
         rounds: tuple[int, ...] = (3, 3),
         scale: float = 0.5,
-        twist: np.ndarray | None = None,
+        twist: np.ndarray = AT_REST,
     ) -> FittedPose:
         """Fit the pose (4, 4) of frame t.
 
@@ -175,9 +175,9 @@ class Observer:
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
         return carry_in_hands(self.joints[[t, u]], pose, centre, radius)
 
-    def assess(self, t: int, pose: np.ndarray, twist: np.ndarray | None = None) -> FittedPose:
+    def assess(self, t: int, pose: np.ndarray, twist: np.ndarray = AT_REST) -> FittedPose:
         """Compare a pose (4, 4) with frame t without a fit; arguments as in :meth:`fit`."""
-        return self.assess_all(t, pose[None], None if twist is None else twist[None])[0]
+        return self.assess_all(t, pose[None], twist[None])[0]
 
     def assess_all(
         self, t: int, poses: np.ndarray, twists: np.ndarray | None = None

@@ -11,9 +11,9 @@ import logging
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
-from intercap_core.geometry.solve.time_series import nearest
+from intercap_core.geometry.solve.time_series import nearest, runs
 from intercap_core.object_track.decoder import HIDDEN, Decoded
-from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
+from intercap_core.object_track.fit import AT_REST, FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses, Prior
 from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO, SEEN_LOG_RATIO
@@ -129,7 +129,8 @@ class Proposals:
         sure = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubtful)}
         uncertain = np.flatnonzero(doubtful).tolist()
         new = False
-        for t in _nearest_first(uncertain, list(sure)):
+        away = dict(zip(uncertain, _distance(uncertain, list(sure)), strict=True))
+        for t in sorted(uncertain, key=away.__getitem__):  # nearest first
             if self._hypotheses.best(t) < poor and t not in self._searched_nearby:
                 new |= self._search_nearby(t, sure)
         near = self._prior.near_annotated(hidden)
@@ -162,7 +163,7 @@ class Proposals:
         self._searched.add(t)
         return self._follow(t, self._observer.search(t))
 
-    def _fit(self, t: int, pose: np.ndarray, twist: np.ndarray | None = None) -> FittedPose:
+    def _fit(self, t: int, pose: np.ndarray, twist: np.ndarray = AT_REST) -> FittedPose:
         """Fit frame t from an inaccurate pose (4, 4), with wide robust scales."""
         return self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0, twist=twist)
 
@@ -192,12 +193,11 @@ class Proposals:
         It is the frame with the largest ``weight`` (T,). Runs shorter than 0.2 s are left out. An
         object that reappears may have been rotated while it was hidden.
         """
-        seen = np.flatnonzero(path != HIDDEN)
-        runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
         return [
-            int(run[weight[run].argmax()])
-            for run in runs
-            if len(run) * self._observer.step_s >= 0.2 and not self._searched & set(run.tolist())
+            first + int(weight[first : last + 1].argmax())
+            for first, last in runs(path != HIDDEN)
+            if (last + 1 - first) * self._observer.step_s >= 0.2
+            and not self._searched & set(range(first, last + 1))
         ]
 
     def _search_nearby(self, t: int, sure: dict[int, np.ndarray]) -> bool:
@@ -306,9 +306,3 @@ def _distance(frames: list[int], known: list[int], default: int = 0) -> list[int
     if not known or not frames:
         return [default] * len(frames)
     return np.abs(nearest(known, frames) - frames).tolist()
-
-
-def _nearest_first(frames: list[int], known: list[int]) -> list[int]:
-    """Sort frames by their distance from the nearest of ``known``, ascending."""
-    distance = dict(zip(frames, _distance(frames, known), strict=True))
-    return sorted(frames, key=distance.__getitem__)

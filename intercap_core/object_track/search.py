@@ -101,7 +101,7 @@ def search_pose(
     fits.sort(key=lambda fit: -fit.log_ratio)
     if fits and everywhere and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        turned = compare(fits[0].pose @ axis_turns(mesh, steps=12))[:3]
+        turned = compare(fits[0].pose @ axis_turns(mesh))[:3]
         fits += fit_starts(turned, fits[0].log_ratio)
         fits.sort(key=lambda fit: -fit.log_ratio)
     return [fits[k] for k in distinct_poses(mesh, [fit.pose for fit in fits])]

@@ -20,13 +20,7 @@ from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.object_track.colour_decision import ColourDecision
-from intercap_core.object_track.decoder import (
-    FREE_COST_S,
-    HIDDEN,
-    Decoded,
-    decode,
-    step_log_ratios,
-)
+from intercap_core.object_track.decoder import FREE_COST_S, HIDDEN, Decoded, decode, step_log_ratios
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import (

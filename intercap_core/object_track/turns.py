@@ -127,8 +127,8 @@ def _surface(mesh: ObjectMesh) -> np.ndarray:
     return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
 
-def axis_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
-    """Return turns (N, 4, 4) of the object about its own axes, ``steps`` angles per full turn.
+def axis_turns(mesh: ObjectMesh) -> np.ndarray:
+    """Return turns (N, 4, 4) of the object about its own axes by multiples of 30 degrees.
 
     They turn about the middle of its box, where a turned silhouette covers the old one best. Turns
     of the symmetry group are left out.
@@ -136,7 +136,7 @@ def axis_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     turns = []
     for axis in object_axes(mesh):
-        for angle in 2 * np.pi * np.arange(1, steps) / steps:
+        for angle in 2 * np.pi * np.arange(1, 12) / 12:
             turn = np.eye(4)
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             turn[:3, 3] = centre - turn[:3, :3] @ centre

@@ -29,14 +29,7 @@ from intercap_core.body.keypoints import KEYPOINT_INDEX, PARTNER
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import midpoints, rays_of
 from intercap_core.geometry.solve.time_series import cheapest_sequence
-from intercap_core.person.sides import (
-    ARMS,
-    HEAD,
-    LEGS,
-    LIMBS,
-    exchange_limb,
-    exchange_points,
-)
+from intercap_core.person.sides import ARMS, HEAD, LEGS, LIMBS, exchange_limb, exchange_points
 
 # Gap between two rays at which the cost is truncated, metres, for arms, legs, head and hands. Rays
 # to one point miss each other by a few centimetres (detector bias, calibration). Rays to a left and

@@ -1,7 +1,7 @@
 """Left and right keypoints: index tables, exchange of sides, and sides stated by the user.
 
 The annotation ``left_right`` lists images in which a detector exchanged the sides. Their keypoints
-are exchanged back before all other steps (:func:`exchange_stated`). If the automatic correction
+are exchanged back before all other steps. If the automatic correction
 later exchanges them again, its result is reversed in that set (:func:`hold_sides`).
 """
 
@@ -98,13 +98,6 @@ def images_with_stated_sides(
         cameras = [sides.camera is None or name == sides.camera for name in names]
         result |= (image_of >= sides.start) & (image_of < sides.end) & np.array(cameras)
     return result
-
-
-def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
-    """Keypoints (T, C, 135, n) with left and right exchanged in the images ``stated`` (T, C)."""
-    if not stated.any():
-        return keypoints
-    return np.where(stated[..., None, None], swap_sides(keypoints), keypoints)
 
 
 def hold_sides(

@@ -21,12 +21,12 @@ In the order of a run (:mod:`intercap_core.stages.scene`):
    - ``slips``: images that are whole frames late;
    - ``keypoint_timing``: sub-frame time offsets.
 
-   The last two share ``keypoint_motion``: smooth paths of the keypoints and their residuals.
+   The last two share ``keypoint_motion``, the residuals of the keypoints against ``smooth_paths``.
 2. ``background`` estimates the static depth of each camera, ``surfaces`` turns background and
    foreground into thinned points with normals.
 3. ``lens_exchange`` corrects pairs of cameras whose intrinsics were exchanged.
 4. ``extrinsics`` refines the poses. ``registration`` has the problem (point-to-plane residuals of
    all pairs of cameras), ``constraints`` its further terms (keypoints, common floor). A refined
    pose is kept only if ``camera_verdicts`` finds it better on held-out data.
-5. ``ground`` fits the floor and the z-up frame, ``up`` the rough up direction it starts from.
+5. ``floor`` chooses the floor and the up direction; ``ground`` fits planes, ``up`` directions.
 """

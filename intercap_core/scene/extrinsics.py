@@ -9,12 +9,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.camera_verdicts import PoseVerdict, judge_poses
-from intercap_core.scene.constraints import (
-    BodyConstraint,
-    BodyViews,
-    FloorConstraint,
-    body_views,
-)
+from intercap_core.scene.constraints import BodyConstraint, BodyViews, FloorConstraint, body_views
 from intercap_core.scene.keypoint_timing import undetermined
 from intercap_core.scene.moments import Moments
 from intercap_core.scene.registration import (
@@ -142,7 +137,7 @@ def refine(
             if np.isfinite(alone.estimate.poses).all():
                 moved = prior.moved(alone.estimate.poses, _inflated(alone.covariance))
                 prior = prior.without(moved)
-        registration = registration.with_prior(prior.precision(COVARIANCE_FACTOR))
+        registration.prior_precision = prior.precision(COVARIANCE_FACTOR)
     unmoved = registration.solve(given, (), known, free_poses=False)
     result, ratios, covariance = unmoved, [], unmoved.covariance
     verdicts: dict[int, PoseVerdict] = {}
@@ -175,7 +170,9 @@ def refine(
     converged = result.last_step_m < 0.001
     verdict = _verdict(rig, pairs, ratios, refined, converged=converged, free=free_poses)
     on_floor = floor.cameras if floor is not None and floor in constraints else ()
-    of_cameras = _verdicts(rig, master, verdicts, verdict)
+    kept = "as given: " + verdict.removesuffix(": poses as given")
+    of_cameras = [str(verdicts[c]) if c in verdicts else kept for c in range(len(rig))]
+    of_cameras[master] = "the master, whose pose is fixed"
     notes = list(_notes(rig, master, pairs, views, refined, on_floor))
     if prior:
         verdict += f"; the given poses are those of sequence {prior.sequence}"
@@ -192,17 +189,9 @@ def refine(
         pairs=pairs,
         verdict=verdict,
         refined=refined,
-        verdicts=of_cameras,
+        verdicts=tuple(of_cameras),
         notes=tuple(notes),
     )
-
-
-def _verdicts(rig: Rig, master: int, own: dict[int, PoseVerdict], of_rig: str) -> tuple[str, ...]:
-    """Reason for each camera's pose: its own verdict, or that of the rig."""
-    kept = "as given: " + of_rig.removesuffix(": poses as given")
-    words = [str(own[c]) if c in own else kept for c in range(len(rig))]
-    words[master] = "the master, whose pose is fixed"
-    return tuple(words)
 
 
 def _inflated(solved: np.ndarray) -> np.ndarray:

@@ -199,19 +199,12 @@ def estimate_offsets(motion: KeypointMotion, master: int, expected: np.ndarray) 
     solved = np.linalg.solve(posterior[views:, views:], matrix[views:, :views])
     information = matrix[:views, :views] - matrix[:views, views:] @ solved
     return TimeOffsets(
-        offset,
-        sigma,
-        (information + information.T) / 2,
-        vector[:views] - solved.T @ vector[views:],
+        offset, sigma, (information + information.T) / 2, vector[:views] - solved.T @ vector[views:]
     )
 
 
 def _inflation(
-    matrices: np.ndarray,
-    vectors: np.ndarray,
-    prior: np.ndarray,
-    free: np.ndarray,
-    own: np.ndarray,
+    matrices: np.ndarray, vectors: np.ndarray, prior: np.ndarray, free: np.ndarray, own: np.ndarray
 ) -> float:
     """Factor by which the offsets' variance exceeds that of the noise model.
 

@@ -15,7 +15,6 @@ A quarter of the points is held out: the fit does not match them, and they serve
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -25,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.scene.surfaces import DepthSurface, NearestPoints
+from intercap_core.scene.surfaces import DepthSurface, NearestPoints, balance_directions
 
 # Smallest standard deviation assumed for point-to-plane residuals; tuned on the studio.
 SURFACE_SIGMA_FLOOR_M = 0.003
@@ -34,31 +33,6 @@ PRIOR_ROTATION_RAD = np.radians(0.5)  # error of a careful calibration; tuned on
 # Largest distance of a point to the nearest point of the other surface: 1.5 times the widest gate.
 # Tuned on the studio.
 SURFACE_SEARCH_M = 0.12
-# Largest share of a pair's weight that one direction keeps. Tuned on the studio: the cameras of
-# config/field/floor.yaml are 4.1 mm off, without this limit 4.4 mm.
-MAX_DIRECTION_SHARE = 0.8
-MAX_DIRECTION_GAIN = 3.0  # largest factor on the weights of other directions; tuned on the studio
-
-
-def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Rescale weights (N,) of points with unit normals (N, 3) so that no direction dominates.
-
-    Points whose normals are within 20 degrees of the dominant direction keep together at most
-    ``MAX_DIRECTION_SHARE`` of the total weight. The other weights are multiplied so that the total
-    is unchanged, but at most by ``MAX_DIRECTION_GAIN``: a few stray points at the edge of a bare
-    floor must not count as a wall.
-    """
-    total = weight.sum()
-    inside = np.ones(len(weight), bool)
-    for _ in range(3):  # until the mean of the dominant direction is stable
-        mean = weight[inside] @ normals[inside]
-        inside = normals @ mean >= 0.94 * np.linalg.norm(mean)  # 20 degrees
-    share = weight[inside].sum() / max(total, 1e-9)
-    if share <= MAX_DIRECTION_SHARE or share >= 1:
-        return weight
-    gain = min(MAX_DIRECTION_GAIN, (1 - MAX_DIRECTION_SHARE) / (1 - share))
-    return weight * np.where(inside, (1 - (1 - share) * gain) / share, gain)
-
 
 # Unknowns of a camera: 0:3 rotation vector about the camera's centre, applied on the left, rad;
 # 3:6 translation, metres; 6 depth bias, metres; 7 time offset, seconds
@@ -193,7 +167,11 @@ class Registration:
             prior: standard deviations of the start's rotations, rad, and translations, metres.
         """
         self.rig = rig
-        self._precision = _precision(len(rig), *prior)
+        # the depth bias deviates by 3 mm, about a quarter of the largest systematic error, 11 mm +
+        # 0.1 % of depth (Azure Kinect DK data sheet)
+        diagonal = np.r_[np.repeat(np.square(prior), 3) ** -1.0, 0.003**-2.0]
+        precision = np.diag(np.tile(diagonal, len(rig))).reshape(len(rig), 7, len(rig), 7)
+        self.prior_precision = precision  # of the start
         self._offset_sigma = np.ones(len(rig)) if offset_sigma is None else offset_sigma
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
@@ -204,12 +182,6 @@ class Registration:
                     if len(surface):
                         by_camera.setdefault(camera, []).append((moment, surface))
             self._seen[kind] = {c: _Seen.of(own) for c, own in sorted(by_camera.items())}
-
-    def with_prior(self, precision: np.ndarray) -> Registration:
-        """The same registration with another precision (C, 7, C, 7) of the start."""
-        other = copy(self)
-        other._precision = precision
-        return other
 
     def solve(
         self,
@@ -254,10 +226,15 @@ class Registration:
             step = np.zeros(count * FREEDOMS)
             system = matrix.reshape(count * FREEDOMS, -1)[np.ix_(rows, rows)]
             step[rows] = -np.linalg.solve(system, gradient.ravel()[rows])
-            current = _stepped(current, step.reshape(count, FREEDOMS))
+            change = step.reshape(count, FREEDOMS)
+            turn = Rotation.from_rotvec(change[:, :3]).as_matrix()
+            current.poses[:, :3, :3] = turn @ current.poses[:, :3, :3]
+            current.poses[:, :3, 3] += change[:, 3:6]
+            current.bias = current.bias + change[:, BIAS]
+            current.offset = current.offset + change[:, OFFSET]
         covariance = np.zeros((count * FREEDOMS, count * FREEDOMS))
         covariance[np.ix_(rows, rows)] = np.linalg.inv(system)
-        last = np.abs(step.reshape(count, FREEDOMS))
+        last = np.abs(change)
         # points are about 2.5 m from the cameras of a ring
         moved = 2.5 * last[:, :3].max(1) + last[:, 3:6].max(1)
         return RigSolution(
@@ -371,29 +348,18 @@ class Registration:
         self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, start: RigEstimate
     ) -> None:
         """Add the prior around ``start`` to the normal equations, in place."""
-        turned = at.poses[:, :3, :3] @ start.poses[:, :3, :3].transpose(0, 2, 1)
-        away = np.column_stack(
-            [
-                Rotation.from_matrix(turned).as_rotvec(),
-                at.poses[:, :3, 3] - start.poses[:, :3, 3],
-                at.bias - start.bias,
-            ]
-        )
-        matrix[:, :OFFSET, :, :OFFSET] += self._precision
-        gradient[:, :OFFSET] += np.einsum("cfdg,dg->cf", self._precision, away)
+        away = np.column_stack([pose_differences(at.poses, start.poses), at.bias - start.bias])
+        matrix[:, :OFFSET, :, :OFFSET] += self.prior_precision
+        gradient[:, :OFFSET] += np.einsum("cfdg,dg->cf", self.prior_precision, away)
         every, precision = np.arange(len(self.rig)), self._offset_sigma**-2.0
         matrix[every, OFFSET, every, OFFSET] += precision
         gradient[:, OFFSET] += precision * (at.offset - start.offset)
 
 
-def _precision(cameras: int, rotation: float, translation: float) -> np.ndarray:
-    """Precision (C, 7, C, 7) of independent poses with these standard deviations, rad and metres.
-
-    The standard deviation of the depth bias is 3 mm: about a quarter of the largest systematic
-    error, 11 mm + 0.1 % of depth (Azure Kinect DK data sheet).
-    """
-    diagonal = np.r_[np.repeat(np.square([rotation, translation]), 3) ** -1.0, 0.003**-2.0]
-    return np.diag(np.tile(diagonal, cameras)).reshape(cameras, 7, cameras, 7)
+def pose_differences(poses: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Rotation vectors, rad, and translations, metres, (C, 6) from ``start`` to ``poses``."""
+    turned = poses[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)
+    return np.hstack([Rotation.from_matrix(turned).as_rotvec(), poses[:, :3, 3] - start[:, :3, 3]])
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -415,11 +381,3 @@ def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray
         return np.column_stack([turning, m.normals, -_dot(m.normals, ray), -m.speed])
 
     return rows(centres[a], m.own_ray), -rows(centres[b], m.other_ray)
-
-
-def _stepped(at: RigEstimate, step: np.ndarray) -> RigEstimate:
-    """The estimate after a step (C, 8) of the unknowns."""
-    poses = at.poses.copy()
-    poses[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :3, :3]
-    poses[:, :3, 3] += step[:, 3:6]
-    return RigEstimate(poses, at.bias + step[:, BIAS], at.offset + step[:, OFFSET])

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
@@ -21,6 +20,7 @@ from intercap_core.scene.registration import (
     PRIOR_ROTATION_RAD,
     PRIOR_TRANSLATION_M,
     RigEstimate,
+    pose_differences,
 )
 from intercap_core.schemas import SCENE
 
@@ -80,7 +80,7 @@ class RigPrior:
                 scene["camera_covariance"][rows][:, :, rows],
             )
         # two careful calibrations of a camera that stands still
-        away = np.abs(_differences(rig.master_from_colour, given))
+        away = np.abs(pose_differences(rig.master_from_colour, given))
         limit = np.sqrt(2) * OUTLIER_SIGMAS * _calibration_sigma()
         for name, own in zip(rig.names, away, strict=True):
             if (own > limit).any():
@@ -113,7 +113,7 @@ class RigPrior:
             covariance: (C, 7, C, 7) of that estimate.
         """
         contradicting = []
-        for c, away in enumerate(_differences(poses, self.poses)):
+        for c, away in enumerate(pose_differences(poses, self.poses)):
             both = (self.covariance + covariance)[c, :BIAS, c, :BIAS]
             if both.any() and away @ np.linalg.solve(both, away) > MOVED_DISTANCE**2:
                 contradicting.append(c)
@@ -127,12 +127,6 @@ class RigPrior:
             covariance[:, :, c, :BIAS] = 0.0
             covariance[c, :BIAS, c, :BIAS] = np.diag(_calibration_sigma() ** 2)
         return replace(self, covariance=covariance)
-
-
-def _differences(poses: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Rotation vectors, rad, and translations, metres, (C, 6) from ``start`` to ``poses``."""
-    turned = poses[:, :3, :3] @ start[:, :3, :3].transpose(0, 2, 1)
-    return np.hstack([Rotation.from_matrix(turned).as_rotvec(), poses[:, :3, 3] - start[:, :3, 3]])
 
 
 def _calibration_sigma() -> np.ndarray:

@@ -24,11 +24,8 @@ import numpy as np
 from intercap_core.formats.recordings.synchronise import usual_steps
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS
-from intercap_core.scene.keypoint_motion import (
-    KeypointMotion,
-    build_motion,
-    with_keypoints,
-)
+from intercap_core.geometry.solve.time_series import runs
+from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion, motion_along
 from intercap_core.scene.keypoint_timing import (
     MIN_TIMING_SETS,
     estimate_noise,
@@ -165,12 +162,6 @@ def _apart(intervals: list[SlipInterval], margin: int) -> list[SlipInterval]:
     return chosen
 
 
-def _runs(chosen: np.ndarray) -> list[np.ndarray]:
-    """Indices of each unbroken run of True."""
-    places = np.flatnonzero(chosen)
-    return np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
-
-
 def _polished(
     slip: np.ndarray,
     keypoints: np.ndarray,
@@ -193,10 +184,12 @@ def _polished(
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
         constant = constant_slip(slip)[c]
-        for run in _runs(slip[:, c] != constant):
+        for first, last in runs(slip[:, c] != constant):
+            run = slice(first, last + 1)
             before = slip.copy()
             before[run, c] = constant
-            shown = with_keypoints(motion, keypoints_by_moment(keypoints, before))
+            by_moment = keypoints_by_moment(keypoints, before)
+            shown = motion_along(motion.paths, by_moment, motion.rig, motion.sigma, motion.bias)
             found = _Evidence(shown.at_offsets(offset), steps, fps).best([c])
             result[run, c] = constant
             for interval in found:

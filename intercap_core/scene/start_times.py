@@ -96,11 +96,7 @@ def find_starts(
     apart = bool((moved | rejected).any()) or known.states_apart(step)
     whole = late if apart else np.where(np.abs(late) > search.slip, late, 0)
     result = replace(
-        as_stated,
-        apart=apart,
-        rejected=rejected,
-        undetermined=tuple(doubts),
-        short=late - whole,
+        as_stated, apart=apart, rejected=rejected, undetermined=tuple(doubts), short=late - whole
     )
     for c in np.flatnonzero(np.arange(views) != master).tolist():
         if not known.known[c] and not result.apart:

@@ -204,8 +204,7 @@ def _state_uncertainty(
     jumped = np.zeros_like(sigma)
     jumped[fitted] = measure_jumps(joints[fitted].astype(float), times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
-        quality.widen_sigma(deviation(covariance), fit.parts),
-        jumped[fit.frames] / MEDIAN_CHI_3,
+        quality.widen_sigma(deviation(covariance), fit.parts), jumped[fit.frames] / MEDIAN_CHI_3
     )
     undetermined = np.ones((count, len(BODY_PARTS)), bool)
     undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)

@@ -36,11 +36,7 @@ MARKER = STAGES["export"].folder_marker
 
 
 def run(
-    *,
-    paths: SequencePaths,
-    models: SequenceModels,
-    settings: ExportSettings,
-    output: Path,
+    *, paths: SequencePaths, models: SequenceModels, settings: ExportSettings, output: Path
 ) -> None:
     """Write the formats of the settings into the new folder ``output``.
 

@@ -19,12 +19,7 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
-from intercap_core.object_track.artefact import (
-    NOT_NAMED,
-    SOURCE_NONE,
-    absent_track,
-    track_datasets,
-)
+from intercap_core.object_track.artefact import NOT_NAMED, SOURCE_NONE, absent_track, track_datasets
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.mesh_check import label_doubt, size_doubt
 from intercap_core.object_track.observer import Observer

@@ -29,9 +29,9 @@ from intercap_core.person.masks import choose_mask, merge_other_candidates
 from intercap_core.person.segmentation.candidate_masks import ImageCandidate, ViewSegments
 from intercap_core.person.sides import (
     BODY_POINTS,
-    exchange_stated,
     hold_sides,
     images_with_stated_sides,
+    swap_sides,
 )
 from intercap_core.person.subject import SubjectDetections, find_subject, subject_keypoints
 from intercap_core.person.subject_hints import named_people, touch_test
@@ -122,7 +122,7 @@ def run(
         person = subject.people
         keypoints = subject_keypoints(found, person)
         stated = images_with_stated_sides(left_right, rig.names, image_of, found.sequence)
-        keypoints = given = exchange_stated(keypoints, stated)
+        keypoints = given = np.where(stated[..., None, None], swap_sides(keypoints), keypoints)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
         # Triangulated are pixels moved to the sets' times (columns 0, 1; confidence in 2). The
         # pixels as detected are carried along as columns 3 and 4, so that their sides are exchanged

@@ -14,55 +14,26 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
-from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, camera_background
 from intercap_core.scene.camera_agreement import find_disagreements, widened
 from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
 from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.depth_scale import describe_depth_scale
 from intercap_core.scene.extrinsics import Refinement, refine
-from intercap_core.scene.ground import (
-    GroundPlane,
-    annotated_ground,
-    describe_raised_feet,
-    fit_ground,
-    fit_ground_to_feet,
-    standing_on_floor,
-    stated_ground,
-    zup_from_master,
-)
+from intercap_core.scene.floor import AnnotatedFloor, floor_and_up, measured_floor
+from intercap_core.scene.ground import GroundPlane, zup_from_master
 from intercap_core.scene.lens_exchange import LensExchange, exchange_lenses
 from intercap_core.scene.moments import Moments, describe_stated_start, find_moments
 from intercap_core.scene.rig_prior import RigPrior
 from intercap_core.scene.starts import NOT_DETERMINED, StatedStarts, describe_start
-from intercap_core.scene.subject_views import SubjectViews, triangulate_views
-from intercap_core.scene.surfaces import (
-    BACKGROUND_CELL_M,
-    DepthSurface,
-    background_surfaces,
-    moving_surfaces,
-)
-from intercap_core.scene.up import (
-    ANNOTATED_POINT_M,
-    FLOOR_DEG,
-    FOOT_PLACE_M,
-    STATED_DEG,
-    UpDirection,
-    balance_levels,
-    camera_levels,
-    check_stated_up,
-    compare_with_stated,
-    estimate_up,
-    floor_levels,
-    rough_up,
-    trunk_direction,
-)
+from intercap_core.scene.subject_views import SubjectViews
+from intercap_core.scene.surfaces import background_surfaces, moving_surfaces
+from intercap_core.scene.up import UpDirection, check_stated_up, trunk_direction
 from intercap_core.schemas import SCENE
 
 # A camera is reported if it sees the rig's centre less accurately than this, because its pose is
 # uncertain (standard deviation).
 WEAK_CAMERA_M = 0.010
-Floor = Sequence[tuple[float, float, float]]  # annotated floor points, master frame, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +68,7 @@ def run(
     detections: Path,
     output: Path,
     settings: SceneSettings,
-    floor: Floor | None,
+    floor: AnnotatedFloor | None,
     starts: Mapping[str, tuple[float, float]] | None = None,
     rig_from: Path | None = None,
 ) -> None:
@@ -143,7 +114,8 @@ def run(
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
-        given_ground = _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
+        tolerance = settings.floor_tolerance_mm / 1000
+        given_ground = measured_floor(source, rig, surfaces, np.zeros(len(rig)), tolerance, floor)
         refined = refine(
             rig,
             master,
@@ -160,17 +132,16 @@ def run(
         if disagreements:
             left = find_disagreements(people, subject, image_of, rig)
             refined = replace(refined, covariance=widened(refined.covariance, rig, left))
-        ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
-        ground, up, more_notes = _with_feet(source, rig, ground, subject, floor)
+        ground = measured_floor(source, rig, surfaces, refined.bias, tolerance, floor)
+        ground, up, more_notes = floor_and_up(source, rig, ground, subject, floor)
         slides, known_to = _slides(rig, refined, up.direction)
         notes = _notes(source, refined, moments, stated, exchanges)
         for one in disagreements:
             notes[one.camera].append(str(one))
-        for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
-            note += [disagreement] if disagreement else []
-            note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
-        for note, scale in zip(notes, scales, strict=True):
-            note += [scale] if scale else []
+        weak = np.linalg.norm(slides, axis=1) > WEAK_CAMERA_M
+        of_pose = [words if bad else "" for words, bad in zip(known_to, weak, strict=True)]
+        for note, *others in zip(notes, disagree, of_pose, scales, strict=True):
+            note += filter(None, others)
         ground_notes += more_notes
         scene = _Scene(
             rig, backgrounds, moments, refined, ground, up, ground_notes, notes, slides, known_to
@@ -209,11 +180,6 @@ def _backgrounds(
     ]
 
 
-def _up(source: Frames, rig: Rig) -> UpDirection:
-    """Approximate up direction, before a floor is known."""
-    return rough_up(rig, source.gravity, source.stated_up)
-
-
 def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
     """Notes on contradictions to the stated up direction; adds the sequence to errors."""
     try:
@@ -222,102 +188,6 @@ def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
         )
     except UserError as error:
         raise UserError(f"sequence {source.sequence}: {error}") from None
-
-
-def _with_feet(
-    source: Frames, rig: Rig, ground: GroundPlane, subject: SubjectViews, floor: Floor | None
-) -> tuple[GroundPlane, UpDirection, list[str]]:
-    """The floor, the up direction, and notes about the floor.
-
-    A measured floor (``ground``) is kept. Otherwise it is the stated floor or, if the feet
-    contradict that or none is stated, the floor under the feet. ``floor``: annotated floor points.
-    """
-    stated = source.stated_up, source.stated_floor
-    middle = ring_centre(rig)
-    toes_and_heels = slice(19, 25)
-    if ground.found:
-        off = FLOOR_DEG
-        if floor is not None:
-            levels = floor_levels(np.array(floor, np.float64), ANNOTATED_POINT_M)
-            off = float(np.degrees(np.linalg.norm(levels[0].sigma))) if levels else np.nan
-        up = UpDirection(ground.normal, "floor", off)
-    else:
-        joints = triangulate_views(subject.keypoints, rig).joints
-        feet = joints[:, toes_and_heels]
-        up = _estimated_up(source, rig, joints, feet)
-        ground = fit_ground_to_feet(feet, up)
-        if np.isfinite(stated[1]).all():
-            denied = ground.found and compare_with_stated(
-                ground.point, ground.normal, *stated, middle
-            )
-            if not denied:
-                ground = stated_ground(*stated)
-                up = UpDirection(stated[0], "stated", STATED_DEG)
-    notes = [ground.note] if ground.note else []
-    if ground.found and ground.source != "feet":
-        above = describe_raised_feet(subject.joints[:, toes_and_heels], ground)
-        notes += [above] if above else []
-    if ground.found:
-        notes += compare_with_stated(ground.point, ground.normal, *stated, middle)
-    return ground, up, notes
-
-
-def _estimated_up(source: Frames, rig: Rig, joints: np.ndarray, feet: np.ndarray) -> UpDirection:
-    """Up direction without a measured floor: as stated, or by all evidence together.
-
-    ``joints`` (T, K, 3) and ``feet`` (T, 6, 3) of the person in the master's frame; NaN = unknown.
-    """
-    rough = _up(source, rig)
-    if rough.source == "stated":
-        return rough
-    standing, _ = standing_on_floor(feet, rough.direction)
-    evidence = [
-        *camera_levels(rig, source.gravity),
-        *floor_levels(standing, FOOT_PLACE_M),
-        *balance_levels(joints),
-    ]
-    return estimate_up(rough, evidence)
-
-
-def _ground(
-    source: Frames,
-    rig: Rig,
-    surfaces: dict[int, DepthSurface],
-    bias: np.ndarray,
-    settings: SceneSettings,
-    floor: Floor | None,
-) -> GroundPlane:
-    """Fit the floor to the background, or to the annotated points if there are any.
-
-    Args:
-        surfaces: background of each camera, depth frame.
-        bias: (C,) depth biases, metres.
-        floor: annotated points; None = not annotated.
-    """
-    points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for c, surface in surfaces.items():
-        pose = rig[c].master_from_depth
-        points.append(apply(pose, surface.points - bias[c] * surface.rays))
-        normals.append(surface.normals @ pose[:3, :3].T)
-    tolerance = settings.floor_tolerance_mm / 1000
-    everything = np.concatenate(points)
-    if floor is not None:
-        try:
-            return annotated_ground(
-                np.array(floor, np.float64), everything, _up(source, rig), tolerance_m=tolerance
-            )
-        except UserError as error:
-            raise UserError(f"sequence {source.sequence}: {error}") from None
-    return fit_ground(
-        everything,
-        np.concatenate(normals),
-        rig,
-        _up(source, rig),
-        tolerance_m=tolerance,
-        # Points of n cameras may overlap on one floor. Each therefore stands for 1 / n of a cell's
-        # area, as if all cameras saw all of it.
-        cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(surfaces))),
-    )
 
 
 def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings) -> None:

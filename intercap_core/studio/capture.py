@@ -22,6 +22,7 @@ from intercap_core import artefacts
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_M, CONTACT_REGIONS, TRUTH
@@ -58,7 +59,7 @@ def write_truth(
     whole = np.stack([camera.object_whole for camera in recorded], 1)
     # a view sees the object if it shows at least 40 pixels and 5 % of it
     views = (seen >= 40) & (seen >= 0.05 * np.maximum(whole, 1))
-    normal = master[:3, 2]  # the stage's z axis
+    normal, broken = master[:3, 2], stage.failures.broken  # the stage's z axis
     with artefacts.write(
         path,
         TRUTH,
@@ -69,7 +70,11 @@ def write_truth(
         ground_offset=float(-normal @ master[:3, 3]),
         fps=float(stage.fps),
         room=stage.furnishing,
-        faults=", ".join(_faults(stage, capture)),
+        faults=", ".join(
+            # with the name of the camera if the fault concerns one
+            f"{kind} {rig.true.names[broken[kind]]}" if kind in broken else kind
+            for kind in capture.faults
+        ),
     ) as file:
         if stage.passer_by:
             file.attributes["passer_by"] = stage.passer_by.subject.name
@@ -104,12 +109,6 @@ def write_truth(
         if stage.prop:
             file.put("object_visible", object_visible)
     return contact
-
-
-def _faults(stage: StudioStage, capture: StudioCapture) -> list[str]:
-    """Faults of the capture, with the name of the camera if they concern one."""
-    names, broken = stage.rig.true.names, stage.failures.broken
-    return [f"{kind} {names[broken[kind]]}" if kind in broken else kind for kind in capture.faults]
 
 
 def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
@@ -196,12 +195,10 @@ def erring_annotation(
 
     intervals = []
     for region, name in enumerate(CONTACT_REGIONS):
-        padded = np.concatenate([[False], contact[:, region], [False]]).astype(int)
-        starts, ends = np.flatnonzero(np.diff(padded) > 0), np.flatnonzero(np.diff(padded) < 0)
-        for start, end in zip(starts, ends, strict=True):
+        for start, end in runs(contact[:, region]):
             reach = round(5 * scale)
             first = int(np.clip(start + rng.integers(-reach, reach + 1), 0, stage.frames - 1))
-            last = int(np.clip(end + rng.integers(-reach, reach + 1), first + 1, stage.frames))
+            last = int(np.clip(end + 1 + rng.integers(-reach, reach + 1), first + 1, stage.frames))
             interval = {"part": name, "start": first, "end": last, "uncertain": "both"}
             intervals.append(interval)
     frame = int(rng.integers(0, max(1, stage.frames // 5)))

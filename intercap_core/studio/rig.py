@@ -78,12 +78,16 @@ def build_rig(
                 unit(rng.normal(size=3)) * 0.010 * noise,
             )
         assert camera.depth is not None
+        # the error of an ill-measured mount: a turn about the camera's centre, and a shift
+        pose = camera.master_from_colour.copy()
+        pose[:3, :3] = error[:3, :3] @ pose[:3, :3]
+        pose[:3, 3] += error[:3, 3]
         claimed.append(
             replace(
                 camera,
                 colour=_recalibrated(camera.colour, rng, noise),
                 depth=_recalibrated(camera.depth, rng, noise),
-                master_from_colour=_about_centre(camera.master_from_colour, error),
+                master_from_colour=pose,
             )
         )
     offset = rng.uniform(-MAX_OFFSET_S, MAX_OFFSET_S, cameras) * noise
@@ -140,14 +144,6 @@ def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
         roll = turn(np.array([0, 0, np.radians(rng.uniform(-1.5, 1.5))]))
         poses.append(rigid(rotation @ roll, eye))
     return poses
-
-
-def _about_centre(master_from_colour: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Rotate a camera about its centre and move it: the error of an ill-measured mount."""
-    moved = master_from_colour.copy()
-    moved[:3, :3] = error[:3, :3] @ moved[:3, :3]
-    moved[:3, 3] += error[:3, 3]
-    return moved
 
 
 def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:

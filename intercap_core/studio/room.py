@@ -80,7 +80,9 @@ def build_room(
     """
     boxes, mesh = list(furniture), None
     if furnishing == "sparse":
-        boxes += [_lowered(piece) for piece in _pieces(rng, eyes)[1:3]]
+        boxes += [
+            replace(box, high=(*box.high[:2], box.high[2] / 2)) for box in _pieces(rng, eyes)[1:3]
+        ]
     elif furnishing == "furnished":
         boxes += _walls(rng) + _pieces(rng, eyes)
         if hidden is not None:
@@ -101,11 +103,6 @@ def build_room(
         tuple(_look(name, rng) for name in names),
         names.index("distractor") if mesh is not None else -1,
     )
-
-
-def _lowered(box: Box) -> Box:
-    """A piece of furniture of half its height."""
-    return replace(box, high=(*box.high[:2], box.high[2] / 2))
 
 
 def _walls(rng: np.random.Generator) -> list[Box]:

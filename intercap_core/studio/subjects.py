@@ -89,6 +89,7 @@ class Subject:
             data = data | _file(BUILDS_FILE)
         i = data["names"].tolist().index(name)
         weights = data["weights"].astype(np.float64)
+        bary = data["fitted_bary"].astype(np.float64)
         return cls(
             name=name,
             gender=str(data["gender"][i]),
@@ -101,7 +102,7 @@ class Subject:
             bulges=data["bulges"].astype(np.float64) * float(data["bulge_scale"][i]),
             clothing=data["clothing"][i].astype(np.float64),
             fitted_face=data["fitted_face"].astype(np.int64),
-            fitted_bary=_normalised(data["fitted_bary"].astype(np.float64)),
+            fitted_bary=bary / bary.sum(1, keepdims=True),
         )
 
     def skin(self, pose: np.ndarray, transl: np.ndarray) -> PosedSubject:
@@ -235,10 +236,6 @@ def _blend_one(mixed, rest, out):
             m = mixed[v, 3 * axis : 3 * axis + 3]
             linear = m[0] * x + m[1] * y + m[2] * z + mixed[v, 9 + axis]
             out[v, axis] = linear + _DUAL_QUATERNION_SHARE * (moved[axis] - linear)
-
-
-def _normalised(barycentric: np.ndarray) -> np.ndarray:
-    return barycentric / barycentric.sum(1, keepdims=True)
 
 
 def _matrices(pose: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit.evidence import fit_confidence_exponent
+from intercap_core.body_fit.keypoint_term import fit_confidence_exponent
 from intercap_core.body_fit.observations import TRUNK_KEYPOINTS, Observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.recover import measure_jumps, recover

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.evaluate.board_recording import write_board_recording
 from intercap_core.body.keypoints import BODY
 from intercap_core.commands.calibrate import calibrate
 from intercap_core.config import FramesSettings
@@ -21,7 +22,6 @@ from intercap_core.formats.calibration.files import read_calibration
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.stages import frames
-from intercap_core.studio.board import write_board_recording
 from tests.calibrate.plain_project import FPS, PlainProject, lenses_of, small_ring, write_walk
 from tests.helpers.synthetic_people import seen_by, stick_person, walker
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.evaluate import body_errors
+from bench.evaluate.body_errors import CLOUD_KEYS, BodyErrors
 from intercap_core.body.keypoints import FACE, KEYPOINT_NAMES
-from intercap_core.evaluation import body, body_errors
-from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
+from intercap_core.evaluation import body
 from tests.helpers import fitted_capture as fitted
 
 OFFSET = fitted.BODY_OFFSET_M
@@ -99,16 +100,16 @@ def test_landmark_alignment_removes_rigid_motion(
     capture: fitted.Capture,
 ) -> None:
     model = capture.model
-    face = body.landmarks(capture.vertices, model.keypoint_map)
+    face = body_errors.landmarks(capture.vertices, model.keypoint_map)
     assert face.shape == (5, 68, 3)
     nose = KEYPOINT_NAMES.index("face_30") - FACE.start  # the tip
     near = np.linalg.norm(capture.vertices - face[:, nose, None], axis=-1).min(1)
     assert near == pytest.approx(0, abs=0.005)
     turned = face @ Rotation.from_rotvec([0.1, -0.4, 0.2]).as_matrix().T + [0.3, 0, -1]
-    assert body.landmark_error(turned, face).min() > 0.1
-    assert body.landmark_error(turned, face, align=True) == pytest.approx(0, abs=1e-6)
+    assert body_errors.landmark_error(turned, face).min() > 0.1
+    assert body_errors.landmark_error(turned, face, align=True) == pytest.approx(0, abs=1e-6)
     mirrored = face * [-1, 1, 1]  # which no turn undoes
-    assert body.landmark_error(mirrored, face, align=True).min() > 0.001
+    assert body_errors.landmark_error(mirrored, face, align=True).min() > 0.001
 
 
 def test_visible_error_uses_truly_visible_vertices() -> None:
@@ -116,7 +117,7 @@ def test_visible_error_uses_truly_visible_vertices() -> None:
     moved = true.copy()
     moved[0, :, 0] = [0.01, 0.03, 0.5, 0.5]
     visible = np.array([[True, True, False, False], [False] * 4])
-    found = body.visible_vertex_error(moved, true, visible)
+    found = body_errors.visible_vertex_error(moved, true, visible)
     assert found == pytest.approx([0.02, np.nan], nan_ok=True)
 
 

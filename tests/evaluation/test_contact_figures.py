@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.contact_figures import (
+from bench.evaluate.sequence_figures import (
     calibration_error,
     detected_figures,
     hold_figures,
-    reliability,
     slip_by_object,
     stated_contact_figures,
     worse_objects,
 )
+from intercap_core.evaluation.contact_figures import reliability
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.motion import Floor, foot_errors, slip_speed, support
 from intercap_core.schemas import METRIC_REGIONS

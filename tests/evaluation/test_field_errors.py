@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.evaluation.field_errors import (
+from bench.evaluate.field_errors import (
     FieldScene,
     beam_figures,
     floor_error,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.evaluation import object_errors, object_pose
+from bench.evaluate import track_errors
+from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -35,18 +36,18 @@ def _errors(translation: list[float], **changed: object) -> ObjectErrors:
 
 def test_add_s_ignores_similar_shapes_mssd_only_symmetries() -> None:
     turned = (QUARTER, NOWHERE, STILL, NOWHERE)
-    assert object_errors.add_s(SQUARE, *turned) == pytest.approx([0])
+    assert track_errors.add_s(SQUARE, *turned) == pytest.approx([0])
     # a quarter turn moves every corner by 2, of a group with the half turn still by 2
     for group in (SymmetryGroup.none(), SymmetryGroup(np.array([np.eye(4), HALF_TURN]))):
-        assert object_errors.mssd(SQUARE, *turned, _mesh(group)) == pytest.approx([2])
+        assert track_errors.mssd(SQUARE, *turned, _mesh(group)) == pytest.approx([2])
     half = (QUARTER @ QUARTER, NOWHERE, STILL, NOWHERE)
-    assert object_errors.mssd(SQUARE, *half, _mesh(SymmetryGroup.none())) == pytest.approx(
+    assert track_errors.mssd(SQUARE, *half, _mesh(SymmetryGroup.none())) == pytest.approx(
         [2 * np.sqrt(2)]
     )
     group = SymmetryGroup(np.array([np.eye(4), HALF_TURN]))
-    assert object_errors.mssd(SQUARE, *half, _mesh(group)) == pytest.approx([0], abs=1e-9)
+    assert track_errors.mssd(SQUARE, *half, _mesh(group)) == pytest.approx([0], abs=1e-9)
     shifted = (STILL, np.array([[0.3, 0, 0]]), STILL, NOWHERE)
-    assert object_errors.add_s(SQUARE, *shifted) == pytest.approx([0.3])
+    assert track_errors.add_s(SQUARE, *shifted) == pytest.approx([0.3])
 
 
 def test_undetermined_axes_are_excluded_from_turn_errors() -> None:
@@ -54,13 +55,13 @@ def test_undetermined_axes_are_excluded_from_turn_errors() -> None:
     covariance = np.eye(6)[None] * deviation**2
     turned = Rotation.from_rotvec([0, 0, 3 * deviation]).as_matrix()[None]
     none = SymmetryGroup.none()
-    found = object_pose.normalised_rotation_error(turned, STILL, covariance, none)
+    found = track_errors.normalised_rotation_error(turned, STILL, covariance, none)
     assert found == pytest.approx([3 / 1.5382], rel=1e-3)
     covariance[:, 2, 2] = np.pi**2
-    found = object_pose.normalised_rotation_error(turned, STILL, covariance, none)
+    found = track_errors.normalised_rotation_error(turned, STILL, covariance, none)
     assert found == pytest.approx([0], abs=1e-6)
     covariance[:, 0, 0] = covariance[:, 1, 1] = np.pi**2
-    assert np.isnan(object_pose.normalised_rotation_error(turned, STILL, covariance, none)).all()
+    assert np.isnan(track_errors.normalised_rotation_error(turned, STILL, covariance, none)).all()
 
 
 def test_lost_frames_are_unnoticed_without_a_flag_or_recovered():
@@ -79,7 +80,7 @@ def test_lost_frames_are_unnoticed_without_a_flag_or_recovered():
 
 def test_figures_by_number_of_views() -> None:
     views = np.array([0, 1, 2, 6, 7])
-    found = object_errors.by_views([_errors([0.1, 0.3, 0.02, 0.004, 0.006], views=views)])
+    found = track_errors.by_views([_errors([0.1, 0.3, 0.02, 0.004, 0.006], views=views)])
     assert list(found) == ["0-1", "2", "6+"]
     assert found["0-1"]["frames"] == 2
     assert found["0-1"]["translation_median_mm"] == pytest.approx(200)

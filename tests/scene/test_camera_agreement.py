@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.faulty_rigs import faulty_cases
+from bench.evaluate.faulty_rigs import faulty_cases
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.scene.camera_agreement import (
     Disagreement,

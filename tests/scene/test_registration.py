@@ -16,18 +16,18 @@ from intercap_core.scene.background import camera_background
 from intercap_core.scene.constraints import BodyConstraint, BodyViews, FloorConstraint, body_views
 from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import (
-    MAX_DIRECTION_GAIN,
-    MAX_DIRECTION_SHARE,
     MOVING,
     STATIC,
     Registration,
     RigEstimate,
-    balance_directions,
 )
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import (
+    MAX_DIRECTION_GAIN,
+    MAX_DIRECTION_SHARE,
     DepthSurface,
     NearestPoints,
+    balance_directions,
     moving_surfaces,
     surface_from_depth,
 )

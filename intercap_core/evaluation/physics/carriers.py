@@ -17,8 +17,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from intercap_core.evaluation.flags import runs
 from intercap_core.evaluation.physics.rest_test import GRAVITY
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.schemas import CONTACT_M
 
 # Half-width of the window of a fitted parabola, seconds. A position error of 3 mm gives an error of

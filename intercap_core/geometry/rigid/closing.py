@@ -87,7 +87,10 @@ def close_mesh(source: Path, output: Path, *, widest_m: float | None, share: flo
     wide = [hole for hole in holes if hole.width_m > limit]
     if wide:
         raise UserError(_refusal(source, wide, limit, length))
-    added = [_fan(hole, len(vertices) + k) for k, hole in enumerate(holes)]
+    added = [  # a fan of faces from each hole's edges to its middle
+        np.stack([hole.loop, np.roll(hole.loop, -1), np.full(len(hole.loop), middle)], axis=1)
+        for middle, hole in enumerate(holes, len(vertices))
+    ]
     middles = np.array([hole.middle for hole in holes])
     colours = get_colours(mesh)
     around = [colours[hole.loop].mean(0).round().astype(np.uint8) for hole in holes]
@@ -149,12 +152,6 @@ def _hole(vertices: np.ndarray, loop: np.ndarray) -> Hole:
     # smallest singular value: root of the summed squared distances from the plane
     across = np.linalg.svd(points - middle, compute_uv=False)[-1] if len(points) > 3 else 0.0
     return Hole(loop, float(width), middle, float(across / np.sqrt(len(points))))
-
-
-def _fan(hole: Hole, middle: int) -> np.ndarray:
-    """Return faces (n, 3) from each edge of the hole to the vertex index ``middle``."""
-    following = np.roll(hole.loop, -1)
-    return np.stack([hole.loop, following, np.full(len(hole.loop), middle)], axis=1)
 
 
 def _with_consistent_winding(

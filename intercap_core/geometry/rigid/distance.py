@@ -101,12 +101,7 @@ class DistanceField:
     """
 
     def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        *,
-        watertight: bool = True,
-        threads: int = 0,
+        self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True, threads: int = 0
     ) -> None:
         vertices = np.ascontiguousarray(vertices, np.float32)
         faces = np.ascontiguousarray(faces, np.uint32)

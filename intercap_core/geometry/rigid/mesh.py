@@ -354,11 +354,7 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
 
 
 def _contact_places(
-    listed: Path | None,
-    path: Path,
-    vertices: np.ndarray,
-    loaded: np.ndarray,
-    place: np.ndarray,
+    listed: Path | None, path: Path, vertices: np.ndarray, loaded: np.ndarray, place: np.ndarray
 ) -> np.ndarray | None:
     """Return indices (K,) of likely-contact vertices after ``place``, or None without a list.
 

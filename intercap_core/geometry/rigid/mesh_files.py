@@ -23,11 +23,7 @@ import trimesh
 from PIL import Image
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import (
-    UnreadableFile,
-    printable,
-    read_bytes,
-)
+from intercap_core.inputs.files import UnreadableFile, printable, read_bytes
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 # Exceptions of trimesh and numpy for damaged files, and of Pillow for damaged textures.

@@ -19,6 +19,12 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
 
 
+def doubled_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return twice the area (F,) of each face, square metres."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return area-weighted outward unit normals (V, 3)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -60,9 +66,7 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> S
 
     The choice is deterministic.
     """
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    reached = np.cumsum(area)
+    reached = np.cumsum(doubled_areas(vertices, triangles))
     faces = np.searchsorted(reached, (np.arange(count) + 0.5) / count * reached[-1])
     number = np.arange(1, count + 1)
     u, v = (number * _STEP_U) % 1, (number * _STEP_V) % 1

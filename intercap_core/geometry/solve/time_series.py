@@ -1,4 +1,4 @@
-"""Functions of time series: interpolation of gaps, velocities, and Viterbi's algorithm."""
+"""Functions of time series: runs, interpolation of gaps, velocities, and Viterbi's algorithm."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ def sample_evenly(available: np.ndarray, most: int) -> np.ndarray:
     if len(frames) <= most:
         return frames
     return frames[np.linspace(0, len(frames) - 1, most).round().astype(int)]
+
+
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and last frame of each unbroken run of set frames of a mask (T,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(first, stop - 1) for first, stop in edges.reshape(-1, 2).tolist()]
 
 
 def nearest(known: np.ndarray | Sequence[int], frames: np.ndarray | Sequence[int]) -> np.ndarray:
@@ -42,11 +48,7 @@ def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np
 
 
 def limited_velocity(
-    positions: np.ndarray,
-    times: np.ndarray,
-    *,
-    max_speed: float,
-    known: np.ndarray | None = None,
+    positions: np.ndarray, times: np.ndarray, *, max_speed: float, known: np.ndarray | None = None
 ) -> np.ndarray:
     """Return velocities (T, ..., D) of positions (T, ..., D) by central differences.
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from intercap_core.annotation import ANY_REGION, ContactInterval
+from intercap_core.geometry.solve.time_series import runs
 
 # Least probability, by distance and slip alone, at which the fit contradicts a statement; chosen.
 CONTRADICTED = 0.95
@@ -97,20 +98,13 @@ def find_issues(
         if part != ANY_REGION:
             during &= evidence[:, of[0]] > 0
         free = (detected[:, of] < 1 - CONTRADICTED).all(axis=1)
-        for run in _runs(during & free & ~unseen):
-            metres = distance[np.ix_(run, of)].min()
+        for first, last in runs(during & free & ~unseen):
+            metres = distance[first : last + 1, of].min()
             text = f"contact of {part} annotated {metres:.2f} m from the object or more"
-            issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
+            issues.append(AnnotationIssue(range(first, last + 1), text, distrusted=True))
     touching = (detected > CONTRADICTED) & (evidence < 0) & ~unseen[:, None]
     for r, region in enumerate(regions):
-        for run in _runs(touching[:, r]):
+        for first, last in runs(touching[:, r]):
             text = f"{region} annotated as free of contact, but it touches the object in the fit"
-            issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
+            issues.append(AnnotationIssue(range(first, last + 1), text, distrusted=True))
     return issues
-
-
-def _runs(mask: np.ndarray) -> list[np.ndarray]:
-    """Return the frames of each run of set frames of ``mask`` (T,)."""
-    frames = np.flatnonzero(mask)
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    return [run for run in runs if len(run)]

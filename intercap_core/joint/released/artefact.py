@@ -26,6 +26,7 @@ from intercap_core.formats.released import (
 )
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.joint.released import behave, intercap
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -92,11 +93,9 @@ def import_joint(
     model = BodyModel.load(
         body_file, num_betas=released.betas.shape[1], num_expression=released.expression.shape[1]
     )
-    places = np.flatnonzero(known)
-    nearest = np.arange(total)
-    nearest[~known] = places[np.abs(places[None] - nearest[~known, None]).argmin(axis=1)]
+    used = nearest(np.flatnonzero(known), np.arange(total))
     shape = np.median(released.betas[known], axis=0)
-    params = _body_parameters(released, model, nearest, shape)
+    params = _body_parameters(released, model, used, shape)
     with torch.no_grad():
         posed = model.forward(params, vertex_ids=model.keypoint_map.vertex_ids)
         keypoints = model.keypoints(posed).double().numpy()
@@ -109,7 +108,7 @@ def import_joint(
             "skin by up to %.0f mm",
             sequence, released.path, 1e3 * variation,
         )  # fmt: skip
-    rotation, translation = released.rotation[nearest], released.translation[nearest]
+    rotation, translation = released.rotation[used], released.translation[used]
     if object_ is None or not np.isfinite(released.translation).any():
         rotation, translation = np.full_like(rotation, np.nan), np.full_like(translation, np.nan)
         if object_ is not None:

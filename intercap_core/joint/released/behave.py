@@ -37,6 +37,7 @@ from intercap_core.formats.released import (
 )
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import read_mesh
+from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.joint.released.surface_fit import fit_surfaces
 
 # Distances between the fitted and the released body above which a frame is flagged.
@@ -137,13 +138,9 @@ def _match_times(times: np.ndarray, known: list[int]) -> dict[int, int]:
     """
     if not known or not np.isfinite(times).all():
         return {}
-    ordered = np.sort(np.array(known))
     wanted = np.rint(1e6 * times).astype(np.int64)
-    right = np.clip(np.searchsorted(ordered, wanted), 0, len(ordered) - 1)
-    left = np.maximum(right - 1, 0)
-    nearer = np.abs(ordered[left] - wanted) < np.abs(ordered[right] - wanted)
-    nearest = ordered[np.where(nearer, left, right)]
-    return {int(t): int(nearest[t]) for t in np.flatnonzero(np.abs(nearest - wanted) <= 5_000)}
+    found = nearest(np.sort(known), wanted)
+    return {int(t): int(found[t]) for t in np.flatnonzero(np.abs(found - wanted) <= 5_000)}
 
 
 def _read_person(

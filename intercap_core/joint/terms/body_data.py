@@ -151,7 +151,7 @@ class BodyData(JointTerm):
         assert views is not None, "refresh comes first"
         problem.views = replace(views, confidence=views.confidence * keypoints)
         if evidence.by_view is not None:
-            problem.rows = evidence.rows(evidence.by_view.points * depth)
+            problem.rows = evidence.rows(evidence.by_view, evidence.by_view.points * depth)
         try:
             return self._equations(state)
         finally:

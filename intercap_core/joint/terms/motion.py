@@ -40,15 +40,6 @@ def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
     return (points[:-2] - 2 * points[1:-1] + points[2:]) * fps**2
 
 
-def pseudo_huber(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (T-2, N) and energies (T-2,) of accelerations (T-2, N, 3).
-
-    The energy is quadratic below ``scale`` and linear above.
-    """
-    root = np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
-    return 1.0 / root, scale**2 * (root - 1.0).sum(axis=1)
-
-
 class _Smoothness(JointTerm):
     """Robust squared accelerations of points."""
 
@@ -73,13 +64,15 @@ class _Smoothness(JointTerm):
         if len(points) < 3:
             return
         acceleration = accelerations(points, self._fps) / BODY_ACCELERATION
-        weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
+        # pseudo-Huber: quadratic below ACCELERATION_OUTLIER, linear above
+        root = np.sqrt(1.0 + np.square(acceleration / ACCELERATION_OUTLIER).sum(axis=2))
+        energy = ACCELERATION_OUTLIER**2 * (root - 1.0).sum(axis=1)
         unit = self._fps**2 / BODY_ACCELERATION
         equations.add_rows(
             self.name,
             columns,
             lambda at, some: rows(at, some) * unit,
-            weight * factor,
+            1.0 / root * factor,
             acceleration,
             energy * factor,
             stencil=ACCELERATION,

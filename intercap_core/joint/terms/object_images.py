@@ -171,7 +171,9 @@ class ObjectImagesData(JointTerm):
         poses, self._every = rigid(state.rotation, state.translation), every
         self._evidence = self._compare_images(poses)
         self._agreeing = {
-            t: evidence for t, evidence in self._evidence.items() if not _contradicts(evidence)
+            t: evidence
+            for t, evidence in self._evidence.items()
+            if sum(view.log_ratio for view in evidence.reports) >= CONTRADICTED_LOG_RATIO
         }
         self._noise = views_noise(list(self._agreeing.values()))
         tracked = self._tracked
@@ -181,7 +183,11 @@ class ObjectImagesData(JointTerm):
         self._by_cameras = {}
         for t, evidence in self._agreeing.items():
             self._compared[t] = poses[t]
-            self._set_form(t, evidence)
+            form = self._form(t, evidence.information.sum(0), evidence.gradient.sum(0))
+            self._matrix[t], self._gradient[t] = form.matrix, form.slope
+            self._by_cameras[t] = self._linearise_cameras(
+                t, evidence, form.weight / self._noise, form.mesh, form.gradient
+            )
 
     def contradicted(self) -> np.ndarray:
         """Mask (T,) of frames whose images contradict the object's pose at the last
@@ -221,14 +227,6 @@ class ObjectImagesData(JointTerm):
         motion = rigid_velocity(poses, tracked.seen, tracked.times)
         motion[tracked.resting] = 0
         return motion
-
-    def _set_form(self, t: int, evidence: ImageEvidence) -> None:
-        """Set the quadratic form of frame ``t``."""
-        form = self._form(t, evidence.information.sum(0), evidence.gradient.sum(0))
-        self._matrix[t], self._gradient[t] = form.matrix, form.slope
-        self._by_cameras[t] = self._linearise_cameras(
-            t, evidence, form.weight / self._noise, form.mesh, form.gradient
-        )
 
     def _form(self, t: int, information: np.ndarray, gradient: np.ndarray) -> _Form:
         """Form of the sum over views, ``information`` (6, 6) and ``gradient`` (6,)."""
@@ -388,8 +386,3 @@ def _equations(
     lowest = np.linalg.solve(matrix + np.diag(UNKNOWN_SIGMA**-2), slope[..., None])[..., 0]
     energy = 0.5 * (offset * bent + lowest * slope) + offset * slope
     return matrix, bent + slope, energy.sum(axis=1)
-
-
-def _contradicts(evidence: ImageEvidence) -> bool:
-    """Whether the images contradict the object's pose."""
-    return sum(view.log_ratio for view in evidence.reports) < CONTRADICTED_LOG_RATIO

@@ -22,7 +22,7 @@ import numpy as np
 from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
-from intercap_core.geometry.rigid.surfaces import sample_surface, vertex_normals
+from intercap_core.geometry.rigid.surfaces import doubled_areas, sample_surface, vertex_normals
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.proximity import ON_SURFACE, along_by_object
 from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
@@ -151,8 +151,7 @@ class ObjectInBody(JointTerm):
         super().__init__(context)
         geometry, weight = context.geometry, context.settings.penetration_weight
         mesh = geometry.mesh
-        a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-        area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+        area = float(doubled_areas(mesh.vertices, mesh.faces).sum()) / 2
         # a point every 6 mm, so that a rim shows on a fingertip; at most 6,000
         count = int(np.clip(area / 0.006**2, 1, 6000))
         samples = sample_surface(mesh.vertices, mesh.faces, count)

@@ -20,13 +20,7 @@ from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.hand_track import CREEP, window_displacement, window_frames
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.contact import Contact
-from intercap_core.joint.terms.term import (
-    SLIP_OUTLIER,
-    Data,
-    Equation,
-    JointTerm,
-    TermContext,
-)
+from intercap_core.joint.terms.term import SLIP_OUTLIER, Data, Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
 STICK_VERTICES = 24  # at most for a patch, whose vertices move nearly as one; tuned on the studio
@@ -93,7 +87,10 @@ class Stick(JointTerm):
         local = local_points(points, state.rotation, state.translation)
         jitter = self._jitter(local)
         if self._steady is None:
-            self._steady = self._weigh_glides(local, jitter)
+            # A displacement of 10 mm beyond the jitter of its mean places counts a quarter; tuned.
+            way = np.square(window_displacement(local, self._fps))
+            noise = 2 * jitter / np.sqrt(window_frames(self._fps))
+            self._steady = geman_mcclure_weight(way, np.hypot(0.01, noise))
         both = both * self._steady
         self._outlier = np.hypot(SLIP_OUTLIER / self._fps, 2 * jitter)
         kept, weights = [np.zeros(0, int)], [np.zeros((len(both), 0))]
@@ -124,17 +121,6 @@ class Stick(JointTerm):
             if len(members) and both.any():
                 result[members] = np.median(step[np.ix_(both, members)])
         return result
-
-    def _weigh_glides(self, local: np.ndarray, jitter: np.ndarray) -> np.ndarray:
-        """Weights (T - 1, M) of patch vertices by their displacement over the object.
-
-        The displacement leads from the mean place of the last 0.2 s to that of the next 0.2 s,
-        whose jitter is that of a step over the root of the number of frames. 10 mm beyond this
-        jitter count a quarter. Both are tuned on the studio.
-        """
-        way = np.square(window_displacement(local, self._fps))
-        frames = window_frames(self._fps)
-        return geman_mcclure_weight(way, np.hypot(0.01, 2 * jitter / np.sqrt(frames)))
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the slip of the vertices of the last :meth:`refresh`."""

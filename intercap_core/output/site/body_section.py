@@ -175,10 +175,14 @@ def _cell(
     """
     lens = camera.colour
     local = apply(camera.colour_from_master, vertices)
-    # the square around the visible vertices
-    crop = _crop(lens.project(local[seen])) if (seen := lens.sees(local)).any() else None
-    if crop is None:
+    seen = lens.sees(local)
+    if not seen.any():
         return None
+    pixels = lens.project(local[seen])
+    low, high = pixels.min(0), pixels.max(0)
+    size = max(int(1.12 * float((high - low).max())), 32)
+    x0, y0 = np.rint((low + high - size) / 2).astype(int)
+    crop = SquareCrop(int(x0), int(y0), size, _CELL_PX)
     cell = crop.extract(rgb)
     drawn = render(vertices, faces, lens, camera.colour_from_master, cull_back=True)
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, FIT_COLOUR)
@@ -192,14 +196,6 @@ def _cell(
     for dot in crop.to_cell(confident[:, :2]):
         cv2.circle(cell, _pixel(dot), 2, KEYPOINT_COLOUR, -1, cv2.LINE_AA)
     return cell
-
-
-def _crop(pixels: np.ndarray) -> SquareCrop:
-    """Return the square around the body's pixels (N, 2)."""
-    low, high = pixels.min(0), pixels.max(0)
-    size = max(int(1.12 * float((high - low).max())), 32)
-    x0, y0 = np.rint((low + high - size) / 2).astype(int)
-    return SquareCrop(int(x0), int(y0), size, _CELL_PX)
 
 
 def _pixel(point: Sequence[int] | np.ndarray) -> tuple[int, int]:

@@ -322,10 +322,8 @@ def camera_colour(c: int) -> str:
     return CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
 
 
-def _rgb(c: int) -> tuple[int, int, int]:
-    text = camera_colour(c)
-    red, green, blue = (int(text[i : i + 2], 16) for i in (1, 3, 5))
-    return red, green, blue
+def _rgb(c: int) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(camera_colour(c)[1:]))
 
 
 def _captioned(name: str, when: str) -> str:

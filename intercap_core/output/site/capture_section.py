@@ -16,7 +16,6 @@ from intercap_core.output.export.motion import describe_up
 from intercap_core.output.site import charts, embed
 from intercap_core.output.site.capture_pictures import (
     CapturePictures,
-    FloorProfile,
     camera_colour,
     draw_capture,
 )
@@ -233,27 +232,19 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
     top = 10 * float(np.ceil(top / 10))
     low = min(float(p.along.min()) for p in every)
     high = max(float(p.along.max()) for p in every)
-    return [
-        (
-            f"the floor along a strip near the middle, {when} refinement" if when
-            else "the floor along a strip near the middle",
-            _profile_chart(profiles, (low, high), top),
+    plots = []
+    for when, profiles in zip(drawn.when, drawn.profiles, strict=True):
+        series = [charts.Series("", camera_colour(p.c), p.along, 1e3 * p.height) for p in profiles]
+        chart = charts.line_chart(
+            series,
+            x_label="along the strip, m",
+            y_label="height over the floor, mm",
+            x_range=(low, high),
+            y_range=(-top, top),
         )
-        for when, profiles in zip(drawn.when, drawn.profiles, strict=True)
-    ]  # fmt: skip
-
-
-def _profile_chart(
-    profiles: Sequence[FloorProfile], x_range: tuple[float, float], top: float
-) -> str:
-    series = [charts.Series("", camera_colour(p.c), p.along, 1e3 * p.height) for p in profiles]
-    return charts.line_chart(
-        series,
-        x_label="along the strip, m",
-        y_label="height over the floor, mm",
-        x_range=x_range,
-        y_range=(-top, top),
-    )
+        refinement = f", {when} refinement" if when else ""
+        plots.append((f"the floor along a strip near the middle{refinement}", chart))
+    return plots
 
 
 def _sets(count: int) -> str:

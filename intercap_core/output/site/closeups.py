@@ -17,7 +17,6 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.evaluation import flags
 from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
@@ -28,6 +27,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.output.site.drawing import (
     ColouredMesh,
     EncodedImage,
@@ -189,7 +189,7 @@ def holds(probability: np.ndarray) -> list[Hold]:
     found = [
         Hold(side, first, last)
         for side, values in zip(SIDES, probability.T, strict=True)
-        for first, last in flags.runs(values > 0.5)
+        for first, last in runs(values > 0.5)
     ]
     return sorted(found, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
 

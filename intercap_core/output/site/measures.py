@@ -14,11 +14,7 @@ from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.physics.rest_test import RELEASED_FRAMES
-from intercap_core.evaluation.verdict.figures import (
-    StatedError,
-    held_out_cameras,
-    stated_errors,
-)
+from intercap_core.evaluation.verdict.figures import StatedError, held_out_cameras, stated_errors
 from intercap_core.output.site import charts
 from intercap_core.output.site.embed import tile
 from intercap_core.stage_list import ESTIMATES

@@ -15,6 +15,7 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.carriers import Carrier
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.flags import OF_OBJECT, PARTS
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, flag_tile, render, span, tile
@@ -240,10 +241,10 @@ def _chart(
     for name, colour, values in lines:
         known = np.flatnonzero(np.isfinite(values))
         # a line for each run of known frames; only the first has a name in the legend
-        for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
-            if len(run):
-                first = run[0] == known[0]
-                series.append(charts.Series(name if first else "", colour, run, values[run]))
+        for first, last in runs(np.isfinite(values)):
+            run = np.arange(first, last + 1)
+            label = name if first == known[0] else ""
+            series.append(charts.Series(label, colour, run, values[run]))
     if not series:
         return None
     return charts.frame_chart(series, len(lines[0][2]), unit), caption
@@ -268,4 +269,4 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str, str]]:
     """Return the runs of set frames (T,) for a row of the timeline."""
-    return [(first, last, "fill any", span(first, last)) for first, last in flags.runs(mask)]
+    return [(first, last, "fill any", span(first, last)) for first, last in runs(mask)]

@@ -166,7 +166,10 @@ def find_static_objects(
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
         """Append the component of points ``members`` to ``objects`` if size and distance fit."""
         own = points[members]
-        size, away = box_diagonal(own), _away(own, walked)
+        size, away = box_diagonal(own), np.inf
+        if len(walked):
+            sample = own[:: max(1, len(own) // 2000)]
+            away = float(cKDTree(walked).query(sample)[0].min())
         # largest size of an object that one person handles, and reach, metres; tuned on the studio
         if size < 2.2 and away < 0.35:
             pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
@@ -179,12 +182,6 @@ def find_static_objects(
             add(standing, True, False)
     objects.sort(key=lambda item: item.away_m)
     return objects[:8], occupied(points)
-
-
-def _away(points: np.ndarray, places: np.ndarray) -> float:
-    """Smallest distance, metres, of points (N, 3) from places (M, 3)."""
-    sample = points[:: max(1, len(points) // 2000)]
-    return float(cKDTree(places).query(sample)[0].min()) if len(places) else np.inf
 
 
 def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:

@@ -12,12 +12,7 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED, HandShape, shape
-from intercap_core.studio.interactions.base import (
-    Interaction,
-    Performance,
-    held_object,
-    upright,
-)
+from intercap_core.studio.interactions.base import Interaction, Performance, held_object, upright
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 from intercap_core.studio.skeleton import turn
 

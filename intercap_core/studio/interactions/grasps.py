@@ -16,7 +16,7 @@ from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.controls import bisect
 from intercap_core.studio.hands import THUMB, Hand, HandShape, shape
-from intercap_core.studio.motion import Puppet
+from intercap_core.studio.motion import RIGHT, Puppet
 from intercap_core.studio.skeleton import unit
 
 PALM_PRESSED_M = 0.001  # depth to which the object presses the palm
@@ -172,28 +172,26 @@ def laid_on(
 
 def wrapped(
     puppet: Puppet,
-    side: int,
-    open_shape: HandShape,
     surface: DistanceField,
     script_from_object: np.ndarray,
     approaches: Iterable[Approach],
 ) -> Grip:
-    """Plan a grip with the palm against the object, the fingers around it, then the thumb.
+    """Plan a grip of the right palm against the object, the fingers around it, then the thumb.
 
     For each approach, several bends and oppositions of the thumb are tried. A try is dropped if the
     open thumb penetrates the object, or if part of the hand, open or closed, is in a hollow. The
     score is the negative sum of the gaps of all fingers. The search ends at a try in which every
     finger meets the object, or after an approach with a nearly closed grip.
     """
-    hand, hollow = puppet.hands[side], Hollow(surface)
+    hand, hollow = puppet.hands[RIGHT], Hollow(surface)
     four = (1, 3, 0, 2)  # middle, ring, index, little finger
     best: tuple[float, Grip] | None = None
     for approach in approaches:
-        wrist = approach.wrist(puppet, side, open_shape, surface, script_from_object)
+        wrist = approach.wrist(puppet, RIGHT, WRAP_OPEN, surface, script_from_object)
         pose = invert(script_from_object) @ wrist
-        around, _ = hand.close(open_shape, WRAP_LIMITS, surface, pose, fingers=four)
+        around, _ = hand.close(WRAP_OPEN, WRAP_LIMITS, surface, pose, fingers=four)
         for bend, opposition in product(THUMB_BENDS, OPPOSITIONS_DEG):
-            opened = replace(open_shape, opposition=opposition)
+            opened = replace(WRAP_OPEN, opposition=opposition)
             if hand.gap(opened, surface, pose, hand.thumb_ids) < -1.5 * PALM_PRESSED_M:
                 continue
             base, middle, end = WRAP_LIMITS["thumb"]

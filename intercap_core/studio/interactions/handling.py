@@ -14,7 +14,6 @@ from intercap_core.studio.controls import Step, WristPose, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
 from intercap_core.studio.interactions.base import Interaction, Performance, held_object, upright
 from intercap_core.studio.interactions.grasps import (
-    WRAP_OPEN,
     Approach,
     Grip,
     around_wall,
@@ -279,8 +278,8 @@ def by_the_wall(script: HandlingScript, height: float) -> Grip:
     ``height``: of the palm above the object's origin, metres; more if the plinth is in the way.
     """
     at = script.pick_pose[:3, 3] + (0, 0, height)
-    return wrapped(script.puppet, RIGHT, WRAP_OPEN, script.prop.surface, script.pick_pose,
-                   around_wall(at, script.top + HandlingScript.fingers_rest_m))  # fmt: skip
+    approaches = around_wall(at, script.top + HandlingScript.fingers_rest_m)
+    return wrapped(script.puppet, script.prop.surface, script.pick_pose, approaches)
 
 
 def palm_below(script: HandlingScript) -> Grip:

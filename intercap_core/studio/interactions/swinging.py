@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.controls import Step, WristPose, plateau, ramp
-from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, wrapped
+from intercap_core.studio.interactions.grasps import Approach, wrapped
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT, Trunk
 from intercap_core.studio.skeleton import unit
@@ -77,8 +77,7 @@ class Swinging(HandlingScript):
         ]
         self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
         self.size = rng.uniform(0.9, 1.1, 3)
-        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.prop.surface, self.pick_pose,
-                                    self._approaches())  # fmt: skip
+        self.grips[RIGHT] = wrapped(puppet, self.prop.surface, self.pick_pose, self._approaches())
         self.hold_s[RIGHT] = (self.attach_s, self.release_s)
 
     def _lying(self, ahead: float, yaw: float) -> np.ndarray:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from bench.evaluate.through_wall import behind_wall
 from intercap_core.evaluation.contact import vertex_contact
-from intercap_core.evaluation.through_wall import behind_wall
 from intercap_core.geometry.rigid.facing import facing_distance
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface

@@ -14,10 +14,11 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.body.joints import BODY_JOINTS, BOTH_HANDS, JOINT_NAMES
+from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels
 from intercap_core.evaluation import body, contact
-from intercap_core.evaluation.figures import Figures
+from intercap_core.evaluation.figures import Figures, finite
 from intercap_core.evaluation.proximity import (
     DEEPEST_M,
     MeasuredCloud,
@@ -37,6 +38,41 @@ from intercap_core.sequence_inputs import SequencePaths
 CLOUD_KEYS = (
     "cloud_to_mesh", "mesh_to_cloud_visible", "cloud_to_mesh_floor", "mesh_to_cloud_visible_floor",
 )  # fmt: skip
+
+
+def visible_vertex_error(
+    vertices: np.ndarray, true_vertices: np.ndarray, visible: np.ndarray
+) -> np.ndarray:
+    """Mean vertex error (...) over the mask ``visible`` (..., V); NaN if the mask is empty."""
+    error = np.linalg.norm(vertices - true_vertices, axis=-1)
+    count = visible.sum(-1)
+    mean = (error * visible).sum(-1) / np.maximum(count, 1)
+    return np.where(count > 0, mean, np.nan)
+
+
+def landmarks(vertices: np.ndarray, keypoints: KeypointMap) -> np.ndarray:
+    """Face landmarks (..., 68, 3) of vertices (..., V, 3): 51 inner ones, then the jaw line."""
+    ids, weights = (
+        np.concatenate([of[FACE], of[CONTOUR]]) for of in (keypoints.ids, keypoints.weights)
+    )
+    return (vertices[..., ids, :] * weights[..., None]).sum(-2)
+
+
+def landmark_error(found: np.ndarray, true: np.ndarray, *, align: bool = False) -> np.ndarray:
+    """Mean distance (...) of corresponding points (..., N, 3).
+
+    ``align`` first applies the rigid transform that best maps the found onto the true points
+    (Kabsch 1976). The remaining error is that of shape and expression, without the head's pose.
+    """
+    if align:
+        middle = true.mean(-2, keepdims=True)
+        centred = found - found.mean(-2, keepdims=True)
+        u, _, vt = np.linalg.svd(np.swapaxes(true - middle, -1, -2) @ centred)
+        flip = np.ones(u.shape[:-1])
+        flip[..., 2] = np.sign(np.linalg.det(u @ vt))
+        rotation = (u * flip[..., None, :]) @ vt
+        found = centred @ np.swapaxes(rotation, -1, -2) + middle
+    return np.linalg.norm(found - true, axis=-1).mean(-1)
 
 
 class BodyClouds:
@@ -157,12 +193,7 @@ class BodyErrors:
         return int(np.nanargmax(self.pve if known else self.joints.mean(1)))
 
 
-def measure(
-    paths: SequencePaths,
-    truth: Path,
-    body_models: BodyModels,
-    gender: str,
-) -> BodyErrors:
+def measure(paths: SequencePaths, truth: Path, body_models: BodyModels, gender: str) -> BodyErrors:
     """Compare the artefact of stage ``body_fit`` with the truth of its recording.
 
     Raises UserError if an artefact cannot be read or the truth is of another recording.
@@ -202,9 +233,7 @@ def measure(
 
 
 def _surface(
-    track: BodyTrack,
-    truth: Truth,
-    clouds: BodyClouds,
+    track: BodyTrack, truth: Truth, clouds: BodyClouds
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Errors of skin and face (T,), and distances to the measured points in every fifth frame."""
     total = len(track.joints)
@@ -216,10 +245,10 @@ def _surface(
     for t, vertices in enumerate(track.vertices()):
         true = truth.vertices[t]
         found["pve"][t] = body.vertex_error(vertices, true)
-        found["visible"][t] = body.visible_vertex_error(vertices, true, truth.visible[t])
-        face, true_face = (body.landmarks(v, keypoints) for v in (vertices, true))
-        found["face"][t] = body.landmark_error(face, true_face)
-        found["face_aligned"][t] = body.landmark_error(face, true_face, align=True)
+        found["visible"][t] = visible_vertex_error(vertices, true, truth.visible[t])
+        face, true_face = (landmarks(v, keypoints) for v in (vertices, true))
+        found["face"][t] = landmark_error(face, true_face)
+        found["face_aligned"][t] = landmark_error(face, true_face, align=True)
         if t % 5 == 0:  # neighbouring frames are redundant
             measured.append(clouds.measure(t, vertices, truth))
     return found, {
@@ -268,20 +297,19 @@ def figures(recordings: Sequence[BodyErrors]) -> Figures:
         values = np.concatenate([np.zeros(0), *(r.clouds[key] for r in recordings if r.clouds)])
         if np.isfinite(values).any():
             found[f"{key}_mm"] = 1e3 * float(np.nanmean(values))
-    found = {key: value for key, value in found.items() if np.isfinite(value)}
-    return found | flag_figures(recordings)
+    return finite(found) | flag_figures(recordings)
 
 
 def flag_figures(recordings: Sequence[BodyErrors]) -> Figures:
     """Shares of flagged and bad frames, and recall and precision of the flags."""
     bad, flagged = (np.concatenate([getattr(r, n) for r in recordings]) for n in ("bad", "flagged"))
-    found = {
+    found: Figures = {
         "flagged_share": float(flagged.mean()),
         "bad_frames_share": float(bad.mean()),
         "bad_frames_recall": contact.recall(flagged, bad),
         "bad_frames_precision": contact.precision(flagged, bad),
     }
-    return {key: value for key, value in found.items() if np.isfinite(value)}
+    return finite(found)
 
 
 def by_interaction(recordings: Sequence[BodyErrors]) -> dict[str, list[BodyErrors]]:

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.evaluate.faulty_rigs import NamedFault
+from bench.evaluate.start_windows import WindowErrors
 from intercap_core import artefacts
 from intercap_core.body.joints import FOOT_JOINTS, JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.evaluation.faulty_rigs import NamedFault
 from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.scene_errors import CUBE_SIDE_M, displacement, rig_centre
-from intercap_core.evaluation.start_windows import WindowErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -172,14 +172,13 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     """
     if not scenes:
         return {}
-    late, sigma, aside, step = (
-        np.concatenate([values(s) for s in scenes])
-        for values in (
-            lambda s: np.abs(s.late_s),
-            lambda s: s.sigma_s,
-            lambda s: s.set_aside,
-            lambda s: np.full(len(s.late_s), 1 / s.fps),
-        )
+    late, sigma, aside = (
+        np.concatenate([getattr(s, name) for s in scenes])
+        for name in ("late_s", "sigma_s", "set_aside")
+    )
+    late, step = (
+        np.abs(late),
+        np.repeat([1 / s.fps for s in scenes], [len(s.late_s) for s in scenes]),
     )
     solved = ~aside & (late < step / 2)
     found = {

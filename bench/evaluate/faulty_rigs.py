@@ -105,8 +105,6 @@ class NamedFault:
     """Share of the cameras at fault that were named; NaN without a fault."""
     false: int
     """Number of correct cameras that were named."""
-    causes: tuple[str, ...]
-    """Causes in words."""
 
 
 def name_faults(frames: Path, detections: Path, scene: Path) -> list[NamedFault]:
@@ -123,11 +121,9 @@ def name_faults(frames: Path, detections: Path, scene: Path) -> list[NamedFault]
     result = []
     for fault, at_fault, altered, moved in faulty_cases(people, rig, master, seed):
         subject = find_subject_views(altered, moved, times).showing(image_of, moved)
-        disagreements = find_disagreements(altered, subject, image_of, moved)
-        named = {one.camera for one in disagreements}
+        named = {one.camera for one in find_disagreements(altered, subject, image_of, moved)}
         share = len(named & at_fault) / len(at_fault) if at_fault else float("nan")
-        causes = tuple(sorted({one.cause for one in disagreements}))
         # without a majority, it is undetermined which camera is correct
         false = 0 if fault == "other session" else len(named - at_fault)
-        result.append(NamedFault(fault, share, false, causes))
+        result.append(NamedFault(fault, share, false))
     return result

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.evaluate import capture_errors
+from bench.evaluate.capture_errors import CaptureErrors, Slip, SlipCounts
 from intercap_core.errors import UserError
-from intercap_core.evaluation import scene_errors
-from intercap_core.evaluation.scene_errors import CaptureErrors, Slip, SlipCounts
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from tests.helpers import fitted_capture as fitted
@@ -19,15 +19,17 @@ UP = np.array([0, 0, 1.0])
 
 def test_offsets_are_relative_to_the_master_which_is_left_out() -> None:
     found, true = np.array([0.010, 0.003, 0.0]), np.array([0.008, 0.0, 0.002])
-    assert scene_errors.offset_errors(found, true, 1) == pytest.approx([-0.001, -0.005])
+    assert capture_errors.offset_errors(found, true, 1) == pytest.approx([-0.001, -0.005])
 
 
 def test_slips_are_runs_of_equal_delay() -> None:
     slip = np.array([[0, 2, 2, 0, 2, 3, 3, 1]]).T
     images = np.array([[1, 1, 1, 0, 1, 1, 1, 0]], bool).T
-    assert scene_errors.slip_events(slip, images) == [Slip(0, 1, 4, 2), Slip(0, 5, 6, 3)]
-    assert scene_errors.slip_events(slip[:0], images[:0]) == []
-    assert scene_errors.slip_events(np.full((3, 1), 4), np.ones((3, 1), bool)) == [Slip(0, 0, 2, 4)]
+    assert capture_errors.slip_events(slip, images) == [Slip(0, 1, 4, 2), Slip(0, 5, 6, 3)]
+    assert capture_errors.slip_events(slip[:0], images[:0]) == []
+    assert capture_errors.slip_events(np.full((3, 1), 4), np.ones((3, 1), bool)) == [
+        Slip(0, 0, 2, 4)
+    ]
 
 
 def test_slips_match_by_camera_and_lag() -> None:
@@ -39,26 +41,26 @@ def test_slips_match_by_camera_and_lag() -> None:
     late[4:8, 1] = 2  # begins two sets late, ends two late: found, with four wrong images
     late[3:5, 2] = 3  # not the right amount: missed, and a false one beside
     late[0, 0] = 1  # nothing slipped here
-    assert scene_errors.compare_slips(late, true, images) == SlipCounts(
+    assert capture_errors.compare_slips(late, true, images) == SlipCounts(
         found=1, missed=1, false=2, images_wrong=7, images=30
     )
-    assert scene_errors.compare_slips(true, true, images) == SlipCounts(2, 0, 0, 0, 30)
+    assert capture_errors.compare_slips(true, true, images) == SlipCounts(2, 0, 0, 0, 30)
     images[:, 2] = False  # what no image shows cannot be missed
-    assert scene_errors.compare_slips(0 * true, true, images).missed == 1
+    assert capture_errors.compare_slips(0 * true, true, images).missed == 1
 
 
 def test_ground_error_of_a_raised_and_of_a_tilted_floor() -> None:
     centre = np.array([3.0, -2.0, 1.1])
-    raised = scene_errors.ground_error(np.array([9.0, 9, 0.105]), UP, UP, -0.1, centre)
+    raised = capture_errors.ground_error(np.array([9.0, 9, 0.105]), UP, UP, -0.1, centre)
     assert raised == pytest.approx((0.005, 0))
     tilt = np.radians(0.5)
     normal = np.array([np.sin(tilt), 0, np.cos(tilt)])
     foot = np.array([3.0, -2.0, 0.1])
-    tilted = scene_errors.ground_error(foot, normal, UP, -0.1, centre)
+    tilted = capture_errors.ground_error(foot, normal, UP, -0.1, centre)
     # the mean of |x| over a disc of radius r is 4 r / (3 pi)
-    expected = np.tan(tilt) * 4 * scene_errors.CAPTURE_RADIUS_M / (3 * np.pi)
+    expected = np.tan(tilt) * 4 * capture_errors.CAPTURE_RADIUS_M / (3 * np.pi)
     assert tilted == pytest.approx((expected, 0.5), rel=1e-3)
-    none = scene_errors.ground_error(np.full(3, np.nan), np.full(3, np.nan), UP, 0.0, centre)
+    none = capture_errors.ground_error(np.full(3, np.nan), np.full(3, np.nan), UP, 0.0, centre)
     assert np.isnan(none).all()
 
 
@@ -88,7 +90,7 @@ def test_figures_of_several_captures() -> None:
         _errors("bare", after=worse, slips=SlipCounts(1, 1, 2, 3, 100), ground_m=0.006),
         _errors(ground_m=np.nan, ground_deg=np.nan),
     ]
-    found = scene_errors.figures(three)
+    found = capture_errors.figures(three)
     assert found["extrinsics_before_mm"] == pytest.approx(20)
     assert found["extrinsics_after_mm"] == pytest.approx(2)
     assert found["extrinsics_worst_camera_mm"] == pytest.approx(3)
@@ -103,12 +105,12 @@ def test_figures_of_several_captures() -> None:
     assert found["ground_missing_share"] == pytest.approx(1 / 3)
     assert found["ground_error_mm"] == pytest.approx(4)
     assert found["depth_bias_error_mm"] == pytest.approx(1)
-    assert scene_errors.figures([]) == {}
+    assert capture_errors.figures([]) == {}
 
 
 def test_a_single_camera_has_no_poses_and_offsets_to_judge() -> None:
     none = np.zeros(0)
-    found = scene_errors.figures(
+    found = capture_errors.figures(
         [_errors(before=none, after=none, offset=none, offset_normalised=none)]
     )
     assert not any(key.startswith(("extrinsics", "offset")) for key in found)
@@ -125,7 +127,7 @@ def test_artefacts_are_compared_by_camera_and_moment(
         scene["slip"][4:, 1] = 1
         # n . x + d = 0 with n = (0, -1, 0): d is the floor's y
         truth.attrs["ground_offset"] = scene["ground_point"][1] + 0.003
-    found = scene_errors.measure(*(made.paths[name] for name in ("frames", "scene", "truth")))
+    found = capture_errors.measure(*(made.paths[name] for name in ("frames", "scene", "truth")))
     assert found.before == pytest.approx([0.012, 0], abs=1e-6)
     assert found.after == pytest.approx([0, 0], abs=1e-6)
     assert found.offset == pytest.approx([-0.002, 0.004])
