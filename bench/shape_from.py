@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.command import exit_on_user_error
+from bench.evaluate.body_errors import landmark_error
 from bench.evaluate.part import number, truth_of
 from intercap_core import artefacts
 from intercap_core.body.loading import load_body_file
@@ -81,7 +82,7 @@ def errors_mm(project: Project, sequence: str, path: Path) -> tuple[float, float
     subject = Subject.load(models.subject.subject)
     rest = file.template + file.shape_directions @ betas
     true = subject.on_fitted_topology(subject.rest[None])[0]
-    shape = body.landmark_error(rest, true, align=True)
+    shape = landmark_error(rest, true, align=True)
     return 1e3 * shape, 1e3 * joints, 1e3 * vertices, str(note.get("shape_note", ""))
 
 
