@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.evaluation.flags import runs
 from intercap_core.evaluation.physics.carriers import (
     Carrier,
     Distances,
@@ -33,6 +32,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import sample_surface
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.schemas import CONTACT_M, JOINT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
