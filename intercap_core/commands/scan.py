@@ -38,7 +38,7 @@ from intercap_core.stages import object_track
 
 READ = ("frames", "detections", "scene", "person")
 ROUNDS = 2  # of tracking and fusion; the second one tracks with a mesh of all frame sets
-TRACKED_VOXELS, TRACKED_FACES = 5e5, 1500  # of the grid and of the mesh that is tracked
+TRACKED_VOXELS, TRACKED_FACES = 100**3, 1500  # of the grid and of the mesh that is tracked
 MIN_TRACKED = 10  # frame sets with a pose
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
 MIN_EXPLAINED = 0.9  # least share of the object's points on the mesh

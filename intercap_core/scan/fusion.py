@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from intercap_core.errors import UserError
-from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scan.handled import Chain
 from intercap_core.scan.surfaces import OBJECT, OTHER, UNKNOWN, DepthImages, ViewSurface
 from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
@@ -23,7 +23,7 @@ FINEST_M = 0.002  # voxel; noise of the averaged surface is not finer
 FUSED_SETS = 60  # frame sets of a recording that are fused, at most twice as many
 ON_GROUND_M = 0.008  # distance of a point on the plane on which the object stands: noise of depth
 LOWEST = 0.5  # percentile of the points' heights on which an object stands
-VOXELS = 6e6  # of the grid around the object: 2 mm for 0.4 x 0.4 x 0.3 m
+VOXELS = 250**3  # of the grid around the object
 COLOURED_SETS = 12  # frame sets whose images give the colours
 
 
@@ -53,7 +53,7 @@ def fuse(
     *,
     up: np.ndarray | None = None,
     ground: float | None = None,
-    voxels: float = VOXELS,
+    voxels: int = VOXELS,
 ) -> ClosedSurface:
     """Closed surface from all recordings, in the object's frame.
 
@@ -63,15 +63,12 @@ def fuse(
             object ends at its lowest points. None = it was lifted and turned.
         ground: height along ``up`` of the plane on which the object stands, metres; None = not
             known. The plane is fused with the object, and the object ends there.
-        voxels: of the grid, which lies along the principal axes of the points.
+        voxels: of the grid.
 
     Raises UserError if no surface is left.
     """
     points = np.concatenate([part.points(t) for part in parts for t in part.sets])
-    axes = np.linalg.eigh(np.cov(points.T))[1]
-    axes[:, 0] *= np.linalg.det(axes)  # no reflection
-    object_from_grid = rigid(axes, np.zeros(3))
-    low, high = np.percentile(points @ axes, (0.2, 99.8), axis=0)
+    low, high = np.percentile(points, (0.2, 99.8), axis=0)
     low, high = low - MARGIN_M, high + MARGIN_M
     voxel = max(FINEST_M, float(np.prod(high - low) / voxels) ** (1 / 3))
     volume = Volume(low, high, voxel)
@@ -81,17 +78,15 @@ def fuse(
             volume.sets += 1
             views = {view.camera: view for view in part.surfaces[t]}
             for c in part.recording.cameras:
-                image = _labelled(
-                    part.recording, t, c, views.get(c), part.poses[t] @ object_from_grid, box
-                )
+                image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)
                 if image is not None:
                     if up is not None and ground is not None:
-                        _label_ground(image, up @ axes, ground)
+                        _label_ground(image, up, ground)
                     volume.integrate(image)
     if up is not None:
         if ground is None:
             ground = float(np.percentile(points @ up, LOWEST))
-        volume.exclude_below(up @ axes, ground)
+        volume.exclude_below(up, ground)
     surface = volume.surface()
     if not len(surface.faces):
         shown = ", ".join(part.recording.frames.sequence for part in parts)
@@ -99,7 +94,7 @@ def fuse(
             f"sequence {shown}: the depth images leave no surface of the object, in {volume.sets} "
             "frame sets with a pose of it; turn it more slowly, and nearer to the cameras"
         )
-    return replace(surface, vertices=surface.vertices @ axes.T)
+    return surface
 
 
 def _labelled(
@@ -114,15 +109,15 @@ def _labelled(
 
     Args:
         view: points that show the object in this image; None if there are none.
-        pose: (4, 4) master_from_grid.
-        box: (8, 3) corners around the object, frame of the grid.
+        pose: (4, 4) master_from_object.
+        box: (8, 3) corners around the object, its frame.
     """
     depth, camera = recording.depth(t, c), recording.rig[c]
     lens = camera.depth
     if depth is None or lens is None:
         return None
-    depth_from_grid = camera.depth_from_master @ pose
-    local = apply(depth_from_grid, box)
+    depth_from_object = camera.depth_from_master @ pose
+    local = apply(depth_from_object, box)
     if local[:, 2].min() < NEAREST_M:
         return None
     kind = np.where(depth > 0, OTHER, UNKNOWN).astype(np.uint8)
@@ -150,7 +145,7 @@ def _labelled(
 
     pinhole = (lens.fx, lens.fy, -first[0] * lens.fx, -first[1] * lens.fy)
     return LabelledDepth(
-        resampled(depth), resampled(kind), resampled(weight), pinhole, depth_from_grid
+        resampled(depth), resampled(kind), resampled(weight), pinhole, depth_from_object
     )
 
 
@@ -159,9 +154,9 @@ def _label_ground(image: LabelledDepth, up: np.ndarray, ground: float) -> None:
     fx, fy, cx, cy = image.pinhole
     row, column = np.indices(image.depth.shape)
     rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(image.depth.shape)], -1)
-    normal = image.depth_from_grid[:3, :3] @ up
+    normal = image.depth_from_object[:3, :3] @ up
     slope = rays @ normal
-    height = image.depth * slope - normal @ image.depth_from_grid[:3, 3] - ground
+    height = image.depth * slope - normal @ image.depth_from_object[:3, 3] - ground
     on = (image.kind == OTHER) & (np.abs(height) < ON_GROUND_M)
     image.kind[on] = OBJECT
     image.weight[on] = (slope[on] / np.linalg.norm(rays[on], axis=1)) ** 2

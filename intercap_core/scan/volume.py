@@ -41,7 +41,7 @@ class LabelledDepth:
     """(h, w) float32: weight of the pixels that show the object."""
     pinhole: tuple[float, float, float, float]
     """fx, fy, cx, cy of the window, pixels; no distortion."""
-    depth_from_grid: np.ndarray
+    depth_from_object: np.ndarray
     """(4, 4), metres."""
 
 
@@ -77,7 +77,7 @@ class Volume:
         """Add the votes of one depth image."""
         _integrate(
             self._distance, self._total, self._near, self._empty, self.low, self.voxel_m,
-            image.depth, image.kind, image.weight, image.pinhole, image.depth_from_grid,
+            image.depth, image.kind, image.weight, image.pinhole, image.depth_from_object,
         )  # fmt: skip
 
     def exclude_below(self, normal: np.ndarray, offset: float) -> None:
