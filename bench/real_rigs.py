@@ -121,7 +121,7 @@ def realsense(clone: Path, folder: Path) -> None:
         sensor.stop()
         sensor.close()
     points = np.random.default_rng(0).uniform((-0.4, -0.3, 0.9), (0.4, 0.3, 3.0), (100, 3))
-    print(f"serial number {serial}")
+    print(f"serial number {serial}, noise of depth {camera.depth_noise:.5f} z^2 m")
     for kind, stream, lens in (
         ("colour", rs.stream.color, camera.colour), ("depth", rs.stream.depth, camera.depth),
     ):  # fmt: skip

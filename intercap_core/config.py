@@ -35,6 +35,10 @@ class FramesSettings(Model):
     """Names of the cameras to use; empty = all. Other cameras are treated as not recorded."""
     depth: bool = True
     """Use depth images. If false, all cameras are treated as colour cameras without depth."""
+    stereo_baseline_m: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Distance between the two infrared lenses of depth cameras that measure by stereo, metres
+    (RealSense D415 0.055, D435 0.050, D455 0.095), unless the recording states it; 0 = time of
+    flight. Noise of stereo grows with squared distance."""
 
 
 class DetectionsSettings(Model):

@@ -42,6 +42,7 @@ _CAMERA_MODELS = {
     "depth_intrinsics": Field(("C", "4"), "float64", "fx, fy, cx, cy; NaN without depth", "px"),
     "depth_distortion": Field(("C", "8"), "float64", "OpenCV k1 k2 p1 p2 k3 k4 k5 k6"),
     "depth_metric_radius": Field(("C",), "float64", "colour_metric_radius of the depth camera; NaN without depth"),
+    "depth_noise": Field(("C",), "float64", "standard deviation of depth over squared distance, of stereo cameras; 0 = time of flight; absent if all are 0", "1/m", optional=True),
     "colour_from_depth": Field(("C", "4", "4"), "float64", "depth camera to colour camera; NaN without depth", "m", "colour camera"),
 }  # fmt: skip
 

@@ -4,7 +4,7 @@ The paper sets its lambdas empirically. Here they follow from the noise and from
 independent pixels of a view. Squared residuals are divided by their variance, and the pixels of a
 term together count as a number of independent samples:
 
-    lambda_depth = VIEW_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
+    lambda_depth = VIEW_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / sigma^2
     lambda_segm = trust VIEW_SAMPLES / m / CONTOUR_SIGMA_PX^2
 
 for each of n depth pixels and m contour pixels (of the mask's contour or of the render's rim,
@@ -131,7 +131,8 @@ class ViewFit:
         if count < MIN_RENDERED_PX:
             return np.zeros((6, 6)), np.zeros(6)
         samples = VIEW_SAMPLES * count / (count + DEPTH_HALF_SAMPLES_PX)
-        weight = samples / count / DEPTH_SIGMA_M**2
+        noise = float(self._view.geometry.camera.stereo_sigma(self._pose[:3, 3]))
+        weight = samples / count / (DEPTH_SIGMA_M**2 + noise**2)
         return weight * hessian, weight * gradient
 
     def contour_terms(

@@ -63,7 +63,13 @@ def run(
     used = _used(names, settings, sequence)
     with artefacts.write(output, FRAMES, settings_digest=digest(settings)) as writer:
         views = [
-            extract(name, layout, writer, depth=settings.depth)
+            extract(
+                name,
+                layout,
+                writer,
+                depth=settings.depth,
+                stereo_baseline_m=settings.stereo_baseline_m,
+            )
             if name in used
             else ExtractedCamera(name, notes=["left out (frames.cameras)"])
             for name in names

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import stereo_depth_noise
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.capture_folder import SOUND_RATE as RATE
 from intercap_core.studio.noise import NoiseSource, gaussian
@@ -29,9 +30,6 @@ LIMITS = {
 
 
 STEREO_BASELINE_M = 0.050  # of a RealSense D435 (data sheet of the D400 series)
-# Standard deviation of the disparity that an active stereo camera measures, pixels. RealSense D400:
-# 0.08 is recommended for real scenes (https://github.com/realsenseai/librealsense/issues/3904).
-STEREO_SUBPIXEL = 0.08
 
 
 @dataclass(frozen=True)
@@ -99,9 +97,7 @@ class DepthSensor:
         self.bias = float(noise.tails(rng.normal(size=1))[0]) * self.bias_m * noise.scale
         self._large = large
         if stereo:
-            # sigma = subpixel z^2 / (f b): RealSense, "Tuning depth cameras for best performance"
-            self.noise_m = 0.0
-            self.noise_per_m2 = STEREO_SUBPIXEL / (view.lens.fx * STEREO_BASELINE_M)
+            self.noise_m, self.noise_per_m2 = 0.0, stereo_depth_noise(view.lens, STEREO_BASELINE_M)
         if large is not None:
             self.bias = large.bias_m
             self.edge_m, self.edge_px = large.edge_m, large.edge_px

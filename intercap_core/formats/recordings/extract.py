@@ -17,7 +17,7 @@ from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encodings import encoded_size, holds_all_pixels
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout, Sound
-from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.rig import Camera, stereo_depth_noise
 from intercap_core.inputs.files import printable
 from intercap_core.progress import Progress
 
@@ -86,10 +86,12 @@ def extract(
     writer: artefacts.Writer,
     *,
     depth: bool = True,
+    stereo_baseline_m: float = 0.0,
 ) -> ExtractedCamera:
     """Copy one camera's images into the artefact; faults become notes of the result.
 
-    Without ``depth``, only colour is copied.
+    Without ``depth``, only colour is copied. ``stereo_baseline_m`` is that of depth cameras whose
+    recording states none; 0 = time of flight.
     """
     view = ExtractedCamera(name)
     if name not in layout.extrinsics.master_from_colour:
@@ -102,6 +104,10 @@ def extract(
     try:
         with layout.open(name) as recording:
             view.source, view.camera = recording.source, recording.camera
+            lens, noise = recording.camera.depth, recording.camera.depth_noise
+            if lens is not None and not noise:
+                noise = stereo_depth_noise(lens, stereo_baseline_m)
+                view.camera = replace(recording.camera, depth_noise=noise)
             view.fps, view.serial = recording.fps, recording.serial
             view.depth_delay_us = recording.depth_delay_us
             _Copy(recording, view, writer, depth=depth).run()

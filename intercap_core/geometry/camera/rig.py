@@ -17,6 +17,19 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import SCENE
 
+# Standard deviation of the disparity that an active stereo camera measures, pixels. RealSense D400:
+# 0.08 is recommended for real scenes (https://github.com/realsenseai/librealsense/issues/3904).
+STEREO_SUBPIXEL = 0.08
+
+
+def stereo_depth_noise(lens: Intrinsics, baseline_m: float) -> float:
+    """Growth with squared distance, 1/m, of the standard deviation of a stereo camera's depth.
+
+    sigma = subpixel z^2 / (f b), as in RealSense's "Tuning depth cameras for best performance". 0
+    for a baseline of 0, which stands for time of flight.
+    """
+    return STEREO_SUBPIXEL / (lens.fx * baseline_m) if baseline_m else 0.0
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -32,6 +45,9 @@ class Camera:
     """(4, 4), metres; None without depth."""
     master_from_colour: np.ndarray
     """(4, 4), metres."""
+    depth_noise: float = 0.0
+    """Growth with squared distance, 1/m, of the standard deviation of depth
+    (:func:`stereo_depth_noise`); 0 = time of flight, whose noise is below its systematic error."""
 
     @cached_property
     def colour_from_master(self) -> np.ndarray:
@@ -61,6 +77,14 @@ class Camera:
             and np.array_equal(self.depth.parameters, self.colour.parameters)
             and np.array_equal(self.colour_from_depth, np.eye(4))
         )
+
+    def stereo_sigma(self, points: np.ndarray) -> np.ndarray:
+        """Standard deviation (...,), metres, of depth at points (..., 3), master frame.
+
+        0 for time of flight. Raises ValueError for a camera without depth.
+        """
+        row = self.depth_from_master[2]
+        return self.depth_noise * (points @ row[:3] + row[3]) ** 2
 
     def moved(self, master_from_colour: np.ndarray) -> Camera:
         """Return the same camera at another pose (4, 4)."""
@@ -115,7 +139,9 @@ class Rig:
         depth = np.stack([c.depth.parameters if c.depth else no_lens for c in self.cameras])
         sizes = [(c.depth.width, c.depth.height) if c.depth else (0, 0) for c in self.cameras]
         poses = [no_pose if c.colour_from_depth is None else c.colour_from_depth for c in self]
-        return {
+        noise = np.array([camera.depth_noise for camera in self])
+        stereo: dict[str, np.ndarray | list[str]] = {"depth_noise": noise} if noise.any() else {}
+        return stereo | {
             "camera_names": list(self.names),
             "colour_size": np.array([(c.colour.width, c.colour.height) for c in self.cameras]),
             "colour_intrinsics": colour[:, :4],
@@ -143,6 +169,7 @@ class Rig:
         cameras = []
         poses = artefact["master_from_colour"]
         names = artefact.text("camera_names")
+        noise = artefact["depth_noise"] if "depth_noise" in artefact else np.zeros(len(names))
         for index, name in enumerate(names):
             lenses: dict[str, Intrinsics | None] = {}
             for kind in ("colour", "depth"):
@@ -158,7 +185,8 @@ class Rig:
             if lenses["colour"] is None:
                 raise ValueError(f"{artefact.path}: camera {name} has no colour image size")
             between = artefact["colour_from_depth"][index] if lenses["depth"] else None
-            cameras.append(Camera(name, lenses["colour"], lenses["depth"], between, poses[index]))
+            camera = Camera(name, lenses["colour"], lenses["depth"], between, poses[index])
+            cameras.append(replace(camera, depth_noise=float(noise[index])))
         return cls(tuple(cameras))
 
 

@@ -43,6 +43,10 @@ _ROS1_TYPES = {
         "std_msgs/Header header\nstring name\nstring fullName\nstring asicName\nuint16 vid\n"
         "uint16 pid\nstring uid\nstring sn\n"
     ),
+    "custom_msg/msg/OBDisparityParam": (
+        "std_msgs/Header header\nfloat64 zpd\nfloat64 zpps\nfloat32 baseline\nfloat64 fx\n"
+        "uint8 bitSize\nfloat32 unit\n"
+    ),
 }
 
 

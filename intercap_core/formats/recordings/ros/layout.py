@@ -43,7 +43,7 @@ from intercap_core.formats.recordings.source import (
     RecordingPreview,
 )
 from intercap_core.formats.recordings.timestamps import frame_rate
-from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.rig import Camera, stereo_depth_noise
 from intercap_core.inputs.files import name_some
 
 SCHEMES: tuple[Scheme, ...] = (realsense.SCHEME, orbbec.SCHEME, standard.SCHEME)
@@ -181,6 +181,7 @@ class RosRecording(CameraRecording):
             None if depth is None else depth.lens,
             streams.colour_from_depth,
             extrinsics.master_from_colour[name],
+            stereo_depth_noise(depth.lens, streams.stereo_baseline_m) if depth else 0.0,
         )
         colour = streams.colour
         first = list(islice(bag.messages(colour.topic), RATE_IMAGES))

@@ -59,7 +59,11 @@ def read(
             f"{bag.path}: the pose of the depth camera is no rigid transform; record colour and "
             "depth in one recording"
         )
-    streams = CameraStreams(colour, depth, pose, serial=serial)
+    disparity = bag.first("/cam/disparityParam")  # of stereo cameras alone
+    baseline_mm = 0.0 if disparity is None else abs(disparity.baseline * disparity.unit)
+    streams = CameraStreams(
+        colour, depth, pose, serial=serial, stereo_baseline_m=float(baseline_mm) * 1e-3
+    )
     inertial = bag.first(f"/cam/streamProfileType_{_ACCELEROMETER}")
     if inertial is None or not is_rigid(_pose(inertial), 1e-3):
         return streams

@@ -68,14 +68,21 @@ def read(
     topic = choose_topic(bag, "depth", depth_topics, preferred)
     match = _IMAGES.fullmatch(topic)
     assert match is not None
-    depth = _stream(bag, topic, _depth_unit(bag, match[1]))
+    unit = _option(bag, match[1], "Depth_Units")
+    depth = _stream(bag, topic, 0.001 if unit is None else unit)
+    baseline_mm = _option(bag, match[1], "Stereo_Baseline")
     colour_from_depth = _pose_in(bag, colour.topic, topic)
     if colour_from_depth is None:
         raise UserError(
             f"{bag.path}: the poses of {colour.topic} and {topic} have no common reference; record "
             "both streams in one recording of one device"
         )
-    return replace(streams, depth=depth, colour_from_depth=colour_from_depth)
+    return replace(
+        streams,
+        depth=depth,
+        colour_from_depth=colour_from_depth,
+        stereo_baseline_m=abs(baseline_mm or 0.0) * 1e-3,
+    )
 
 
 def _stream(bag: Bag, topic: str, unit_m: float = 0.001) -> Stream:
@@ -145,16 +152,14 @@ def _pose(bag: Bag, topic: str) -> tuple[str, np.ndarray]:
     return where.removeprefix(prefix).removeprefix("ref_"), pose
 
 
-def _depth_unit(bag: Bag, sensor: str) -> float:
-    """Metres for one unit of depth; 0.001, that of all devices, if it was not recorded.
+def _option(bag: Bag, sensor: str, name: str) -> float | None:
+    """Value of an option of a sensor; None if it was not recorded.
 
-    Recorders until the middle of 2019 wrote a space instead of the underscore.
+    Recorders until the middle of 2019 wrote spaces instead of underscores.
     """
-    for name in ("Depth_Units", "Depth Units"):
-        message = bag.first(f"{sensor}/option/{name}/value")
-        if message is not None:
-            return round(float(message.data), 8)  # of single precision
-    return 0.001
+    topics = (f"{sensor}/option/{own}/value" for own in (name, name.replace("_", " ")))
+    message = next((bag.first(topic) for topic in topics if topic in bag.topics), None)
+    return None if message is None else round(float(message.data), 8)  # of single precision
 
 
 def _text_of(bag: Bag, topic: str) -> dict[str, str]:

@@ -71,7 +71,7 @@ def read(
     colour, frame = _stream(bag, "colour", topics["colour"], preferred, lens)
     accelerometer, rotation = _accelerometer(bag, path, frame, transforms)
     if not topics["depth"]:
-        return CameraStreams(colour, None, None, frame, "", accelerometer, rotation)
+        return CameraStreams(colour, None, None, frame, "", 0.0, accelerometer, rotation)
     depth, depth_frame = _stream(bag, "depth", topics["depth"], preferred, depth_lens)
     pose = np.eye(4) if frame == depth_frame else transforms.between(frame, depth_frame)
     if depth.lens is depth_lens or pose is None:
@@ -82,7 +82,7 @@ def read(
             f"{quoted(frame)}, and no static transform connects them; record /tf_static, or depth "
             "that is aligned to colour, or state the depth of the camera in column calibration"
         )
-    return CameraStreams(colour, depth, pose, frame, "", accelerometer, rotation)
+    return CameraStreams(colour, depth, pose, frame, "", 0.0, accelerometer, rotation)
 
 
 def _accelerometer(

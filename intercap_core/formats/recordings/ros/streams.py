@@ -50,6 +50,8 @@ class CameraStreams:
     """Coordinate frame of the colour images; "" = not stated."""
     serial: str = ""
     """Serial number of the device; "" = not stated."""
+    stereo_baseline_m: float = 0.0
+    """Distance of the two infrared lenses of a stereo camera; 0 = time of flight, or not stated."""
     accelerometer: str = ""
     """Topic of type :data:`IMU` with accelerations; "" = none."""
     colour_from_accelerometer: np.ndarray | None = None

@@ -13,6 +13,8 @@ from rosbags.typesys import get_types_from_msg
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.layouts import open_layout, recognise_recordings
+from intercap_core.formats.recordings.ros.bag import Bag
+from intercap_core.formats.recordings.ros.orbbec import SCHEME
 from tests.formats.recordings.ros.test_standard import row
 from tests.helpers.ros_files import (
     COLOUR_FROM_DEPTH,
@@ -42,6 +44,20 @@ float32[4] cameraIntrinsic
 float32[8] cameraDistortion
 uint8 distortionModel
 """
+DISPARITY = """std_msgs/Header header
+float64 zpd
+float64 zpps
+float32 baseline
+float64 fx
+uint8 bitSize
+float32 unit
+float32 minDisparity
+uint8 packMode
+float32 dispOffset
+int32 invalidDisp
+int32 dispIntPlace
+uint8 isDualCamera
+"""
 INERTIAL = """std_msgs/Header header
 uint8 streamType
 uint8 format
@@ -66,9 +82,9 @@ DEPTH_FROM_ACCELEROMETER = np.array(
 K1_TO_K6_P1_P2 = (0.1, -0.05, 0.01, 0.2, -0.03, 0.004, 0.001, -0.002)
 
 
-def write(path: Path, *, model: int = 4, profiles: bool = True) -> None:
+def write(path: Path, *, model: int = 4, profiles: bool = True, disparity: bool = False) -> None:
     with BagFile(path, "bag") as bag:
-        texts = {"OBStreamProfileInfo": PROFILE,
+        texts = {"OBStreamProfileInfo": PROFILE, "OBDisparityParam": DISPARITY,
                  "OBImuStreamProfileInfo": INERTIAL}  # fmt: skip
         for name, text in texts.items():
             bag.store.register(get_types_from_msg(text, f"custom_msg/msg/{name}"))
@@ -85,6 +101,11 @@ def write(path: Path, *, model: int = 4, profiles: bool = True) -> None:
             profile(bag, 2, COLOUR_SIZE, COLOUR_K, model)
             profile(bag, 3, DEPTH_SIZE, DEPTH_K, model)
         inertial(bag)
+        if disparity:
+            bag.add("/cam/disparityParam", "custom_msg/msg/OBDisparityParam", START_NS,
+                    header=bag.header(START_NS, ""), zpd=0.0, zpps=0.0, baseline=50.0, fx=38.0,
+                    bitSize=12, unit=1.0, minDisparity=0.0, packMode=0, dispOffset=0.0,
+                    invalidDisp=0, dispIntPlace=0, isDualCamera=1)  # fmt: skip
 
 
 def profile(bag: BagFile, number: int, size: tuple[int, int], k: np.ndarray, model: int) -> None:
@@ -124,7 +145,7 @@ def layout_of(folder: Path) -> Any:
 
 
 def test_streams_lenses_and_pose_are_read(tmp_path: Path) -> None:
-    write(tmp_path / "k1.bag")
+    write(tmp_path / "k1.bag", disparity=True)
     assert recognise_recordings(tmp_path) == ("ros", ["k1"])
     with layout_of(tmp_path).open("k1") as recording:
         camera, images = recording.camera, list(recording.images())
@@ -139,6 +160,8 @@ def test_streams_lenses_and_pose_are_read(tmp_path: Path) -> None:
     assert [i.time_us for i in depth] == [(START_NS + t * PERIOD_NS) // 1000 for t in range(3)]
     colour = [image.content for image in images if image.kind == "colour"]
     assert colour == [jpeg(colour_image(t)) for t in range(3)]
+    with Bag(tmp_path / "k1.bag") as bag:
+        assert SCHEME.read(bag, "", (), None).stereo_baseline_m == pytest.approx(0.05)
 
 
 def test_missing_profiles_and_other_lens_models_are_named(tmp_path: Path) -> None:

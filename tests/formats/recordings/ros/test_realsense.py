@@ -31,7 +31,7 @@ from tests.helpers.ros_files import (
 )
 
 rs = pytest.importorskip("pyrealsense2", reason="RealSense's library has no package here")
-IMAGES, UNIT_M = 6, 0.0005
+IMAGES, UNIT_M, BASELINE_MM = 6, 0.0005, 50.0
 COLOUR_FROM_DEPTH = pose(0.03, 0.0148, 0.0003, -0.0002)
 # Of a D455's colour camera, rounded.
 COEFFICIENTS = [-0.055, 0.066, -0.0008, 0.0004, -0.021]
@@ -82,6 +82,7 @@ class Recorded:
         depth_sensor = device.add_sensor("Stereo Module")
         colour_sensor = device.add_sensor("RGB Camera")
         depth_sensor.add_read_only_option(rs.option.depth_units, UNIT_M)
+        depth_sensor.add_read_only_option(rs.option.stereo_baseline, BASELINE_MM)
         self.depth_lens = lens(DEPTH_SIZE, 38.0, rs.distortion.brown_conrady, [0.0] * 5)
         model = rs.distortion.inverse_brown_conrady if colour_model is None else colour_model
         self.colour_lens = lens(COLOUR_SIZE, 60.0, model, COEFFICIENTS)
@@ -175,7 +176,7 @@ def test_fisheye_colour_is_refused(tmp_path: Path) -> None:
 def test_text_in_bags_of_ros_2_is_read(tmp_path: Path, space: str) -> None:
     """Topics and text as release 2.59 of the recorder wrote them to a ``.db3``.
 
-    Names of options had a space until 2019.
+    Names of options had spaces until 2019.
     """
     prefix, times = "/device_0/sensor_0", [5_000_000, 5_033_333]
     rotation = ",".join(f"{value:.6f}" for value in COLOUR_FROM_DEPTH[:3, :3].T.ravel())
@@ -184,6 +185,7 @@ def test_text_in_bags_of_ros_2_is_read(tmp_path: Path, space: str) -> None:
     texts = {
         "/device_0/info": "Name=Intel RealSense D455;Serial Number=012345",
         f"{prefix}/option/Depth{space}Units/value": "0.000500",
+        f"{prefix}/option/Stereo{space}Baseline/value": "95.000000",
         f"{prefix}/Depth_0/camera_info": "width=40;height=30;fx=38;ppx=20.5;fy=39;ppy=14.75;"
         "model=Brown Conrady;coeffs=0,0,0,0,0",
         "/device_0/sensor_1/Color_0/camera_info": "width=64;height=48;fx=60;ppx=32.5;fy=61;"
@@ -220,6 +222,7 @@ def test_text_in_bags_of_ros_2_is_read(tmp_path: Path, space: str) -> None:
     assert np.allclose(camera.colour_from_depth, COLOUR_FROM_DEPTH, atol=1e-5)
     assert recording.gravity == pytest.approx(COLOUR_FROM_DEPTH[:3, :3] @ DOWN, abs=1e-5)
     assert np.allclose(camera.colour.distortion[:5], COEFFICIENTS)
+    assert camera.depth_noise == pytest.approx(0.08 / (38.0 * 0.095))
     for kind in ("colour", "depth"):
         assert [image.time_us for image in images if image.kind == kind] == times
     depth = [image.content for image in images if image.kind == "depth"]

@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encodings import encoded_size
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.layouts import open_layout, recognise_recordings
 from intercap_core.formats.recordings.source import CameraRecording, Image
 from intercap_core.geometry.camera.transforms import invert
+from intercap_core.stages import frames
 from tests.helpers.ros_files import (
     COLOUR_FROM_DEPTH,
     COLOUR_K,
@@ -247,6 +250,17 @@ def test_a_topic_that_stops_is_noted(tmp_path: Path) -> None:
     with open_camera(tmp_path, "k1") as recording:
         list(recording.images())
     assert "/k1/depth/image_raw stops 2.9 s before /k1/color/image_raw" in " ".join(recording.notes)
+
+
+@pytest.mark.parametrize("baseline", [0.0, 0.05])
+def test_a_stated_baseline_gives_the_noise_of_stereo(tmp_path: Path, baseline: float) -> None:
+    with BagFile(tmp_path / "walk", "mcap") as bag:
+        write_camera(bag)
+    path, settings = tmp_path / "frames.h5", FramesSettings(stereo_baseline_m=baseline)
+    frames.run(sequence=row(tmp_path), output=path, settings=settings)
+    with Frames.open(path) as read_back:
+        found = read_back.rig[0].depth_noise
+    assert found == pytest.approx(0.08 / (DEPTH_K[0, 0] * baseline) if baseline else 0.0)
 
 
 def test_static_transforms_are_followed_through_the_tree(tmp_path: Path) -> None:
