@@ -41,23 +41,31 @@ _BOARD_SETS, _BOARD_FPS = 60, 2
 
 
 def measure(project: Project, sequence: str) -> list[RigErrors]:
-    """Errors of the poses by the person, and without depth also by a board."""
+    """Errors of the poses by the person, and also by the background or, without depth, a board.
+
+    A bare room has no background that determines poses.
+    """
     row = project.sequences[sequence]
     paths = project.paths(sequence)
     depth = project.captures[sequence].depth
+    assert project.config.studio is not None  # rows of this part are virtual
+    stage = StudioStage(
+        project.captures[sequence], project.config.studio, project.object_of(sequence)
+    )
     found = [
         _errors(
             project, sequence, "person_depth" if depth else "person_colour",
             [(paths.frames, paths.detections)], board=False,
         )
     ]  # fmt: skip
+    if depth and stage.furnishing != "bare":
+        paths_of_both = [(paths.frames, paths.detections)]
+        found.append(
+            _errors(project, sequence, "background", paths_of_both, board=False, background=True)
+        )
     if not depth:
         folder = project.results / "boards" / sequence
         if not folder.exists():
-            assert project.config.studio is not None  # rows of this part are virtual
-            stage = StudioStage(
-                project.captures[sequence], project.config.studio, project.object_of(sequence)
-            )
             part = folder.with_suffix(".part")
             write_board_recording(
                 part, stage.rig.true, parse_board(BOARD), sets=_BOARD_SETS, fps=_BOARD_FPS, seed=1
@@ -79,6 +87,7 @@ def _errors(
     recorded: Sequence[tuple[Path, Path | None]],
     *,
     board: bool,
+    background: bool = False,
 ) -> RigErrors:
     height = project.subjects[project.sequences[sequence].subject].height
     try:
@@ -87,6 +96,7 @@ def _errors(
             board=parse_board(BOARD) if board else None,
             height_m=height,
             distance=None,
+            background=background,
         )
     except UserError as error:
         return RigErrors(sequence, evidence, np.zeros(0), np.zeros(0), str(error))
@@ -94,7 +104,7 @@ def _errors(
     errors = pose_errors(truth_of(project, sequence), found.rig.names, poses)
     sigma = np.array([found.sigma_m(c) for c in range(1, len(found.rig))])
     rig = RigErrors(sequence, evidence, errors, sigma)
-    if not (project.captures[sequence].depth and project.sequences[sequence].object):
+    if evidence != "person_depth" or not project.sequences[sequence].object:
         return rig
     try:
         return dataclasses.replace(rig, chain=_chain_errors(project, sequence, found.rig))

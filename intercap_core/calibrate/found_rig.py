@@ -53,6 +53,8 @@ class FoundRig:
     """(T, 3) middle of the person's hips, master frame, metres; NaN = unknown."""
     scale: str
     """What determines the scale."""
+    by_background: dict[int, frozenset[int]] = field(default_factory=dict)
+    """Cameras placed by the static background, with the cameras that agree on their poses."""
     notes: list[str] = field(default_factory=list)
     new_lenses: dict[str, LensEstimate] = field(default_factory=dict)
     """Estimated or refined lenses by camera."""

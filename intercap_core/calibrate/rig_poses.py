@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_INDEX
+from intercap_core.body.keypoints import KEYPOINT_INDEX, NUM_KEYPOINTS
 from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust, jackknife_covariance
+from intercap_core.calibrate.background import confirm_by_joints, place_by_background
 from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
@@ -42,6 +43,7 @@ from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import invert
+from intercap_core.scene.background import camera_background
 from intercap_core.scene.registration import Constraint
 from intercap_core.scene.start_times import MAX_DELAY_S
 
@@ -73,6 +75,7 @@ def find_poses(
     distance: tuple[str, str, float] | None,
     without_lens: frozenset[str] = frozenset(),
     keep_lenses: bool = True,
+    background: bool = False,
 ) -> FoundRig:
     """Find the poses of all cameras; the first camera is the master.
 
@@ -85,6 +88,7 @@ def find_poses(
         distance: two cameras and the metres between their lenses; overrides all other scales.
         without_lens: cameras whose lens is a guess, to be estimated from the board.
         keep_lenses: do not replace stated lenses (those in a Kinect's recording cannot be).
+        background: place all cameras by the static background instead of joints and boards.
     """
     with ExitStack() as stack:
         opened = [stack.enter_context(Frames.open(frames)) for frames, _ in recordings]
@@ -104,11 +108,11 @@ def find_poses(
         if board is not None:
             check_board_size(rig, views, board)
         max_lag = max(1, round(MAX_DELAY_S * opened[0].fps))
-        found, views, of_board = _place(rig, views, board, max_lag)
+        found, views, of_board = _place(rig, views, board, max_lag, opened[0], background)
         found.notes += notes
         found.new_lenses = new_lenses
         _add_lens_errors(found)
-        metric = first_camera(views) is not None
+        metric = first_camera(views) is not None or bool(found.by_background)
         found.scale = "depth" if metric else ""
         if metric and board is not None and found.boards.any():
             found.scale = "board" if not _has_depth(views) else "board and depth"
@@ -227,7 +231,7 @@ def _in_use(terms: tuple[JointTerm, BoardTerm | None]) -> list[Constraint]:
 
 
 def _place(
-    rig: Rig, views: Views, board: Board | None, max_lag: int
+    rig: Rig, views: Views, board: Board | None, max_lag: int, frames: Frames, background: bool
 ) -> tuple[FoundRig, Views, list[BoardTerm]]:
     """Place and adjust all cameras, relative to the first of the rig.
 
@@ -239,7 +243,18 @@ def _place(
         return at.moved(adjust(terms, at.master_from_colour, placed[1:], steps=8)[0])
 
     log.info("placing %d cameras", len(rig))
-    rig, views, placed, left = place_all(rig, views, board, max_lag, improve)
+    placed: list[int] = []
+    left: list[Placement] = []
+    if not background:
+        rig, views, placed, left = place_all(rig, views, board, max_lag, improve)
+    by_background: dict[int, frozenset[int]] = {}
+    if len(placed) < len(rig):
+        log.info("comparing backgrounds")
+        unknown = np.full((frames.num_sets, NUM_KEYPOINTS, 3), np.nan)
+        backgrounds = [camera_background(frames, c, unknown) for c in range(len(rig))]
+        rig, by_background = place_by_background(rig, backgrounds, frames.gravity, placed)
+        confirm_by_joints(rig, views, by_background)
+        placed = sorted({*placed, *by_background})
     if len(placed) < len(rig):
         raise UserError(_describe_unplaced(rig, placed, left))
     rig = rig.moved(invert(rig[0].master_from_colour) @ rig.master_from_colour)
@@ -261,6 +276,12 @@ def _place(
         pairs=compare_pairs(rig, views, joints),
         walk=walk,
         scale="",
+        by_background=by_background,
+        notes=[
+            f"{rig.names[c]} is placed by the background that it shares with "
+            f"{', '.join(rig.names[w] for w in sorted(witnesses))}"
+            for c, witnesses in sorted(by_background.items())
+        ],
     )
     return found, views, [boards] if boards is not None and len(boards) else []
 
@@ -312,15 +333,18 @@ def _describe_unplaced(rig: Rig, placed: Sequence[int], left: Sequence[Placement
     return (
         f"not all cameras could be placed (placed: {known}; {'; '.join(reasons)}). Walk to and fro "
         "where these cameras and a placed one see you at the same time, for ten seconds or more, "
-        "or show both a board; then calibrate again. Nothing was written"
+        "or show both a board; then calibrate again. The background places a camera only if two "
+        "other depth cameras see the same furniture. Nothing was written"
     )
 
 
 def _check_walk(found: FoundRig, views: Views) -> None:
-    """Raise UserError if a camera without a board shares no walk; note short walks."""
+    """Raise UserError if a camera without board and background shares no walk; note short walks."""
     joints = (views.confidence[:, :, JOINTS] > 0).sum(2) >= MIN_SEEN
     common = joints & (joints.sum(1, keepdims=True) >= 2) & np.isfinite(found.walk[:, :1])
     for c in np.flatnonzero(found.boards == 0).tolist():
+        if c in found.by_background:
+            continue
         rows = common[:, c]
         extent = lasts = 0.0
         if rows.any():
@@ -359,13 +383,22 @@ def _check_agreement(found: FoundRig) -> None:
 def _refine(
     found: FoundRig, frames: Frames, people: PeopleOfImages, terms: Sequence[BoardTerm]
 ) -> None:
-    """Refine the poses on depth surfaces, in place."""
+    """Refine the poses on depth surfaces, in place.
+
+    Raises UserError if surfaces do not confirm the cameras that were placed by their background.
+    """
     if sum(camera.depth is not None for camera in found.rig) < 2:
         return
     log.info("registering surfaces")
-    for _ in range(2):  # the second time, people and backgrounds are found at better poses
+    for first in (True, False):  # the second time, people and backgrounds are found at better poses
         refined = refine_on_surfaces(frames.at(found.rig), people, 0, terms)
         if refined is None:
+            if first and found.by_background:
+                raise UserError(
+                    "the cameras' backgrounds do not fit to each other at the poses by which most "
+                    "of them agree; let a person walk through the common view, or show a board. "
+                    "Nothing was written"
+                )
             return
         found.rig = found.rig.moved(refined.poses)
         poses, sigma = found.rig.master_from_colour, DEPTH_SCALE_SIGMA

@@ -168,6 +168,14 @@ def calibrate(
     master: Annotated[
         str | None, typer.Option(help="The camera whose frame is the world; default: the first.")
     ] = None,
+    background: Annotated[
+        bool,
+        typer.Option(
+            "--background",
+            help="Place three or more depth cameras by the furniture and walls that they share. "
+            "A person's joints only confirm the poses.",
+        ),
+    ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Overwrite an existing file.")] = False,
 ) -> None:
     """Find the poses of all cameras from a recording, without or with a board.
@@ -188,6 +196,7 @@ def calibrate(
     path, page = run_calibration(
         project, sequence, output=output, lenses=lenses, board=board,
         recordings=recordings or [], distance=distance, master=master, replace=replace,
+        background=background,
     )  # fmt: skip
     typer.echo(f"written: {path}\npicture and table: {page}")
 

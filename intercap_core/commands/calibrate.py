@@ -33,6 +33,7 @@ def calibrate(
     distance: str | None,
     master: str | None,
     replace: bool,
+    background: bool = False,
 ) -> tuple[Path, Path]:
     """Find the poses, write them and a page, and print a summary.
 
@@ -64,6 +65,7 @@ def calibrate(
         distance=parsed_distance,
         without_lens=draft.without_lens,
         keep_lenses=draft.content is None,
+        background=background,
     )
     with Frames.open(paths[0][0]) as frames:
         up = rough_up(found.rig, frames.gravity).direction

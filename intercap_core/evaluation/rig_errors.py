@@ -90,7 +90,7 @@ class RigErrors:
 
     sequence: str
     evidence: str
-    """Key of the figures: person_depth, person_colour or board."""
+    """Key of the figures: person_depth, person_colour, board or background."""
     error: np.ndarray
     """(C - 1,) displacement over a 2 m cube of the cameras but the master, metres; empty if the
     poses were not found."""
