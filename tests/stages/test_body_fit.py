@@ -19,7 +19,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle, vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit import evidence, uncertainty
+from intercap_core.body_fit import evidence, schedule, uncertainty
 from intercap_core.body_fit.clouds import person_clouds
 from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
@@ -232,6 +232,12 @@ def test_the_same_input_gives_the_same_bytes(clothed) -> None:
 def test_a_recording_of_two_blocks_is_fitted_as_one_of_a_single_block(
     model, tmp_path, monkeypatch
 ) -> None:
+    """Both are solved to convergence: rounding would let frames stop after different steps."""
+
+    def solve(*args, **options):
+        return levenberg_marquardt.minimise(*args, **(options | {"cost_tolerance": 1e-7}))
+
+    monkeypatch.setattr(schedule, "minimise", solve)
     capture = Capture(model, tmp_path, 24, cameras=3, clothing=0.01)
     whole = capture.fit(tmp_path / "whole.h5")
     for module in (levenberg_marquardt, evidence, uncertainty):
