@@ -175,7 +175,7 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """Recall and precision of the flags for truly bad bodies and objects after ``joint``.
 
     ``bad_frames`` is the share of frames whose body or object is bad. ``..._with_physics``: objects
-    that physics contradicts count as flagged too.
+    that physics contradicts count as flagged too; omitted if physics was tested in no sequence.
     """
     flagged, physical, bad, bad_frames = [], [], [], []
     for s in sequences:
@@ -196,7 +196,8 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
         return {}
     true = np.concatenate(bad)
     result = {"bad_frames": float(np.concatenate(bad_frames).mean())}
-    for found, suffix in ((flagged, ""), (physical, "_with_physics")):
+    tested = any("physics/bad" in s.values for s in sequences)
+    for found, suffix in ((flagged, ""), (physical, "_with_physics"))[: 1 + tested]:
         mask = np.concatenate(found)
         result[f"flag_recall{suffix}"] = contact.recall(mask, true)
         result[f"flag_precision{suffix}"] = contact.precision(mask, true)

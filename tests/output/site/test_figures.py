@@ -121,6 +121,12 @@ def test_flags_are_judged_on_truly_bad_frames() -> None:
     assert found == pytest.approx({"bad_frames": 0.75, "flag_recall": 1 / 3, "flag_precision": 1})
     s.values["flagged"][1, PARTS.index("object")] = True  # says nothing about the body
     assert figures.flag_figures([s])["flag_recall"] == pytest.approx(1 / 3)
+    s.values["physics/bad"] = np.array([True, False, False, True])  # frame 0 is fine
+    with_physics = figures.flag_figures([s])
+    assert with_physics["flag_recall_with_physics"] == pytest.approx(2 / 3)
+    assert with_physics["flag_recall"] == pytest.approx(1 / 3)
+    # flagged objects of frames 1 and 2, contradicted ones of 0 and 3: those of 2 and 3 are bad
+    assert with_physics["flag_precision_with_physics"] == pytest.approx(1 / 2)
     assert figures.flag_figures([sequence()]) == {}
 
 
