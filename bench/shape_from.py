@@ -34,7 +34,7 @@ from intercap_core.schemas import BODY_FIT, SCENE
 from intercap_core.stages import body_fit
 from intercap_core.studio.subjects import Subject
 
-TWO_VIEWS = ["k1", "k3"]
+TWO_VIEWS = ("k1", "k3")
 
 
 def with_two_colour_views(project: Project) -> Project:
