@@ -238,13 +238,11 @@ def _refine(first: _LevelView, second: _LevelView, pose: Pose, reach_m: Sequence
 
 
 def _judge(first: _LevelView, second: _LevelView, pose: Pose) -> float:
-    """Score of a pose: patches above the floor that agree with it, less those that contradict it.
+    """Return the score of a pose in patches above the floor; 0 = the pose is rejected.
 
-    Returns 0 for a wrong pose.
-
-    A patch agrees if both measure a surface there that faces the same way. It is against the pose
-    if one measures a surface there and the other sees through it: surfaces that never move, as
-    people and what they carry are at several places.
+    A patch supports the pose if both cameras measure a surface there that faces the same way. It
+    contradicts the pose if one camera measures a surface there and the other sees through it. Only
+    static surfaces count: people and carried objects move between the images of the two cameras.
     """
     points = apply(pose, second.points)
     both = np.hstack([points, NORMAL_M * second.normals @ pose[:3, :3].T])
@@ -263,6 +261,7 @@ def _judge(first: _LevelView, second: _LevelView, pose: Pose) -> float:
 
 
 def _count_patches(points: np.ndarray) -> int:
+    """Number of cubes of side :data:`PATCH_M` that hold points (N, 3), metres."""
     return len(np.unique(np.floor(points / PATCH_M).astype(int), axis=0))
 
 
@@ -293,7 +292,7 @@ class _Option:
 
 
 class _Rooms:
-    """What the cameras see of the room, and how they fit together."""
+    """Level views of all cameras, and the relative poses that their backgrounds allow."""
 
     def __init__(self, views: Mapping[int, _LevelView], placed: Sequence[int]) -> None:
         """Search the poses of all pairs but those of two ``placed`` cameras."""

@@ -95,6 +95,6 @@ def test_a_person_confirms_or_contradicts_the_background() -> None:
     poses[2] = invert(zup_from_master) @ half_turn @ zup_from_master @ poses[2]
     with pytest.raises(UserError, match=r"k3: its background fits to that of k1, k2.*not where"):
         confirm_by_joints(rig.moved(poses), views, {2: frozenset({0, 1})})
-    nobody = views.only(np.zeros(views.confidence.shape, bool))
+    empty = views.only(np.zeros(views.confidence.shape, bool))
     with pytest.raises(UserError, match=r"k3.*too few joints.*walk through the common view"):
-        confirm_by_joints(rig, nobody, {2: frozenset({0, 1})})
+        confirm_by_joints(rig, empty, {2: frozenset({0, 1})})

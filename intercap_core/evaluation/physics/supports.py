@@ -78,7 +78,7 @@ class StaticScene:
         if on_level.mean() < 0.5:
             return _unknown("the surface under it is not level")
         if not _covers(near[on_level, :2], centre[:2]):
-            return _unknown("its centre of mass is beside the surface under it")
+            return _unknown("its centre of mass does not lie above its support")
         return Support("furniture", float(np.median(near[on_level, 2])))
 
     def near(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:

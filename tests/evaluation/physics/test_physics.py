@@ -109,9 +109,9 @@ def test_a_support_that_the_scene_does_not_hold_is_named() -> None:
     scene = StaticScene(True, True, table(0.7))
     assert "no surface" in support(scene, at(1.5)).reason
     assert "no surface" in support(StaticScene(False, False, np.zeros((0, 3))), at(0.2)).reason
-    beside = at(0.9)
-    beside[0, 3] += 0.45
-    assert "beside" in support(scene, beside).reason
+    shifted = at(0.9)
+    shifted[0, 3] += 0.45
+    assert "does not lie above its support" in support(scene, shifted).reason
     rough = table(0.7)
     rough[:, 2] += np.random.default_rng(1).uniform(-0.03, 0.03, len(rough))
     assert "not level" in support(StaticScene(True, True, rough), at(0.9)).reason
