@@ -117,8 +117,6 @@ class ObjectTrackSettings(Model):
     term."""
     lost_overlap: Fraction = 0.25
     """The track is lost if the mean overlap over its views is below this value."""
-    render_on: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Device that renders the object; auto = cpu, and cuda is refused with an error."""
 
 
 def _packaged_definition(value: Any) -> Any:
@@ -454,8 +452,6 @@ class Config(Model):
     results: Path = Path("results")
     """Folder of all results, relative to the folder that
     holds ``config/``, or to that of a settings file outside of ``config/``."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the fits: the CPU; cuda is refused with an error."""
     body_models: BodyModels = BodyModels()
     """SMPL-X files; without one, the open body is used."""
     frames: FramesSettings = FramesSettings()

@@ -253,10 +253,6 @@ def read_project(
     ]
     if not set(rows) - set(config.exclude) and not any(str(table) in fault for fault in faults):
         faults.append(f"{table}: holds no sequence (or all are excluded); add at least one row")
-    if config.device == "cuda":
-        faults.append(
-            f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
-        )
     subjects = {name: row for name, row in people.items() if row is not None}
     objects = {name: entry for name, entry in entries.items() if entry is not None}
     project = Project(config, path, valid, subjects, objects, frozenset(rows))

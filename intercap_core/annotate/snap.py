@@ -18,7 +18,8 @@ from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import open_renderer
+from intercap_core.geometry.rigid.render import Renderer
+from intercap_core.geometry.solve.thread_pool import threads_of_job
 from intercap_core.object_track.fit import FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
@@ -90,7 +91,7 @@ def _fitted(
     edges and corners. The four most likely of these starts are fitted. Returns the most likely fit.
     """
     context = FitContext(
-        mesh, labels, settings.min_overlap, settings.background_term, open_renderer("cpu")
+        mesh, labels, settings.min_overlap, settings.background_term, Renderer(threads_of_job())
     )
 
     def fitted(pose: np.ndarray) -> FittedPose:

@@ -13,7 +13,8 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
-from intercap_core.geometry.rigid.render import open_renderer
+from intercap_core.geometry.rigid.render import Renderer
+from intercap_core.geometry.solve.thread_pool import threads_of_job
 from intercap_core.object_track.evidence import ERROR_LASTING_S, ImageEvidence, evidence_at
 from intercap_core.object_track.fit import AT_REST, FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.motion import carry_in_hands
@@ -61,7 +62,7 @@ class Observer:
     def __post_init__(self) -> None:
         self.views = ViewCache(self.load)
         self._progress = Progress(log, f"{self.mesh.name}: fitted", None, "poses")
-        settings, renderer = self.settings, open_renderer(self.settings.render_on)
+        settings, renderer = self.settings, Renderer(threads_of_job())
         self.context = FitContext(
             self.mesh, self.labels, settings.min_overlap, settings.background_term, renderer
         )

@@ -486,12 +486,6 @@ def test_an_invalid_body_file_stops_before_any_job(
     assert " file body.npz " in lines[0]
 
 
-def test_fits_on_a_gpu_are_refused(inside: Path) -> None:
-    load_project(Path("config.yaml"), {"device": "cpu"})
-    with pytest.raises(UserError, match=r"config\.yaml: device is 'cuda', .* set device: cpu"):
-        load_project(Path("config.yaml"), {"device": "cuda"})
-
-
 @pytest.fixture
 def detections(tmp_path: Path) -> Path:
     """A detections artefact of one camera and two frame sets."""

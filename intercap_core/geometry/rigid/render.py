@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal
 
 import numba
 import numpy as np
 
-from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Drawable, Rendering, Shot, Surface
@@ -56,23 +54,6 @@ class Renderer:
             )
 
         return self.pool.map(draw_shot, shots)
-
-
-def open_renderer(
-    device: Literal["auto", "cpu", "cuda"] = "auto", *, threads: int | None = None
-) -> Renderer:
-    """Return the renderer of a device: the CPU for ``cpu`` and ``auto``.
-
-    Args:
-        device: the setting ``object_track.render_on``. Raises UserError for ``cuda``.
-        threads: default as many as the job may use.
-    """
-    if device == "cuda":
-        raise UserError(
-            "object_track.render_on is 'cuda', expected 'cpu' or 'auto': objects are drawn on the "
-            "CPU only; set object_track.render_on: cpu"
-        )
-    return Renderer(threads_of_job() if threads is None else threads)
 
 
 @lru_cache(maxsize=1)

@@ -28,7 +28,7 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.transforms import rigid, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import open_renderer
+from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.solve.robust import OUTLIER_SIGMAS, geman_mcclure_weight
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.geometry.solve.time_series import rigid_velocity
@@ -78,7 +78,7 @@ class ObjectImages:
         self.first = 0
         self.views = self._cache()
         self.mesh = mesh.simplified(TRACKING_FACES)
-        renderer = open_renderer(settings.render_on, threads=1)
+        renderer = Renderer(threads=1)
         self.context = FitContext(
             self.mesh, labels, settings.min_overlap, settings.background_term, renderer
         )

@@ -6,13 +6,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.render import (
     Renderer,
     default_renderer,
-    open_renderer,
     render,
     render_scene,
 )
@@ -116,13 +114,6 @@ def test_batches_equal_single_images(objects, threads):
         for name in ("depth", "face", "body"):
             np.testing.assert_array_equal(getattr(image, name), getattr(one, name))
     assert images[-3].area > 0 and images[-2].area == 0 and images[-1].area == 0
-
-
-def test_a_gpu_is_refused():
-    assert open_renderer("cpu", threads=2).pool.threads == 2
-    assert open_renderer("auto", threads=1).pool.threads == 1
-    with pytest.raises(UserError, match=r"set object_track\.render_on: cpu"):
-        open_renderer("cuda")
 
 
 def test_threads_of_the_job(monkeypatch):
