@@ -1,7 +1,8 @@
 """`intercap dev evaluate`: virtual recordings compared with their truth.
 
 - ``run``: the command; runs the workflows, measures, prints and writes the figures.
-- ``part``: the type of a part of the evaluation, and caching of measured errors.
+- ``part``: the type of a part of the evaluation.
+- ``tables``: tables of the figures.
 - ``sequences``, ``captures``, ``objects``, ``bodies``, ``field_scenes``, ``field``,
   ``detector``, ``rig``, ``scan``: the nine parts.
 - ``workflows``: brings the artefacts of all projects up to date, and measures the minutes of each

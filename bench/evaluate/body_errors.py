@@ -146,14 +146,10 @@ BODY_JOINT_NAMES = JOINT_NAMES[BODY_JOINTS]
 class BodyErrors:
     """Errors of one body over T frames, metres; NaN = unknown."""
 
-    sequence: str
-    """Name of the sequence."""
     interaction: str
     """Script that the studio's person performs."""
     truth: Path
     """The file with the truth."""
-    views: int
-    """Number of cameras with images."""
     pve: np.ndarray
     """(T,) mean error of all vertices."""
     visible: np.ndarray
@@ -186,12 +182,6 @@ class BodyErrors:
         """Mask (T,) of frames with a vertex error above 40 mm."""
         return self.pve > BAD_BODY_M
 
-    @property
-    def worst(self) -> int:
-        """The frame with the largest vertex error, or joint error if no vertex error is known."""
-        known = np.isfinite(self.pve).any()
-        return int(np.nanargmax(self.pve if known else self.joints.mean(1)))
-
 
 def measure(paths: SequencePaths, truth: Path, body_models: BodyModels, gender: str) -> BodyErrors:
     """Compare the artefact of stage ``body_fit`` with the truth of its recording.
@@ -200,9 +190,8 @@ def measure(paths: SequencePaths, truth: Path, body_models: BodyModels, gender: 
     """
     track = read_body(paths.body_fit, "body_fit", body_models, gender)
     with artefacts.read(paths.scene, SCENE) as found:
-        sequence, fps = str(found.attributes["sequence"]), float(found.attributes["fps"])
+        fps = float(found.attributes["fps"])
         known = Truth.load(truth, found["times"], fps, track.model.num_vertices)
-        views = int(found["present"].sum())
     with artefacts.read(truth, TRUTH) as true:
         interaction = str(true.attributes["interaction"])
     found_errors = body_errors(known, track, fps)
@@ -213,10 +202,8 @@ def measure(paths: SequencePaths, truth: Path, body_models: BodyModels, gender: 
         points = BodyClouds(images, rig, masks, found["depth_bias"], track.model)
         surface, clouds = _surface(track, known, points)
     return BodyErrors(
-        sequence=sequence,
         interaction=interaction,
         truth=truth,
-        views=views,
         joints=body.joint_errors(track.joints, known.joints),
         hands=found_errors["hand_mpjpe"],
         hands_wrist=found_errors["hand_mpjpe_wrist"],
@@ -312,22 +299,10 @@ def flag_figures(recordings: Sequence[BodyErrors]) -> Figures:
     return finite(found)
 
 
-def by_interaction(recordings: Sequence[BodyErrors]) -> dict[str, list[BodyErrors]]:
-    """The recordings of each interaction, by name."""
-    names = sorted({r.interaction for r in recordings})
-    return {name: [r for r in recordings if r.interaction == name] for name in names}
-
-
-def by_joint(recordings: Sequence[BodyErrors]) -> dict[str, tuple[float, float, float]]:
-    """Mean and 95th percentile of each body joint's error, mm, and its median normalised error."""
-    errors, ratios = (
-        np.concatenate([getattr(r, name) for r in recordings]) for name in ("joints", "normalised")
-    )
+def joint_figures(recordings: Sequence[BodyErrors]) -> Figures:
+    """Mean error of each body joint, ``joint_<name>_mm``."""
+    mean = np.concatenate([r.joints for r in recordings]).mean(0)
     return {
-        name: (
-            1e3 * float(errors[:, j].mean()),
-            1e3 * float(np.percentile(errors[:, j], 95)),
-            float(np.median(ratios[:, j])),
-        )
-        for j, name in enumerate(BODY_JOINT_NAMES)
+        f"joint_{name}_mm": 1e3 * float(value)
+        for name, value in zip(BODY_JOINT_NAMES, mean, strict=True)
     }

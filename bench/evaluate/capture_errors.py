@@ -56,8 +56,6 @@ class CaptureErrors:
     Cameras without an image, or without depth, are excluded.
     """
 
-    sequence: str
-    """Name of the sequence."""
     room: str
     """Kind of room; "bare" = nothing but the floor."""
     before: np.ndarray
@@ -195,7 +193,6 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
             rig_centre(true_poses),
         )
         return CaptureErrors(
-            sequence=str(found.attributes["sequence"]),
             room=str(true.attributes.get("room", "")),
             before=before,
             after=after,

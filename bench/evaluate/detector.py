@@ -22,7 +22,6 @@ from bench.evaluate.part import (
     Measured,
     config_files,
     keyed,
-    number,
     truth_of,
     variant,
     with_spread,
@@ -37,11 +36,9 @@ from bench.evaluate.start_windows import (
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.truth import match_times
-from intercap_core.evaluation.verdict.figures import TRUE, StatedError, stated_errors
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project
 from intercap_core.schemas import JOINT, METRIC_REGIONS, SCENE, TRUTH
@@ -224,47 +221,6 @@ def flat(evaluations: Sequence[DetectorSequences]) -> Figures:
     }
 
 
-def print_tables(evaluations: Sequence[DetectorSequences]) -> None:
-    """Print the errors of each recording, and the stated and the true errors."""
-    columns = [*FIGURES, "grip_slip_mm"]
-    heads = [name.replace("_mm", " mm").replace("_", " ") for name in columns]
-    for found in evaluations:
-        table = ListTable("recording", *heads, title=f"{found.dataset}, after joint")
-        for name, some in [*((r.metrics.name, [r]) for r in found.errors), ("all", found.errors)]:
-            row = figures(some)
-            digits = (2 if "f1" in column else 1 for column in columns)
-            table.add_row(name, *map(number, (row.get(column) for column in columns), digits))
-        standard_console().print(table)
-        table = ListTable("recording", *TRUE, *(f.name for f in fields(RigErrors)))
-        table.title = (
-            f"{found.dataset}: true error, stated error and its 80 % range, mm; cameras: RMS of "
-            "error and standard deviation"
-        )
-        table.caption = "* the true error is outside the range"
-        for recording in found.errors:
-            stated = {error.part: error for error in stated_errors(recording.metrics)}
-            cells = (statement(stated[part]) if part in stated else "" for part in TRUE)
-            rig = (getattr(recording.rig, f.name).rms() for f in fields(RigErrors))
-            rms = (f"{number(true, 1)}: {number(sigma, 1)}" for true, sigma in rig)
-            table.add_row(recording.metrics.name, *cells, *rms)
-        row = figures(found.errors)
-        shares = (number(row.get(f"verdict_coverage_{part}"), 2) for part in TRUE)
-        table.add_row("share in the range", *shares)
-        standard_console().print(table)
-        for name in found.missing:
-            print(f"{found.dataset}: {name}: no metrics")
-
-
-def statement(error: StatedError) -> str:
-    """Text of the true and the stated error, such as ``12.0*: 8.0 (6.0 to 10.7)``."""
-    true = number(error.true, 1)
-    if not np.isfinite(error.stated):
-        return f"{true}: none stated" if true else ""
-    low, high = error.stated / error.factor, error.stated * error.factor
-    mark = "" if not true or error.covers else "*"
-    return f"{true}{mark}: {error.stated:.1f} ({low:.1f} to {high:.1f})"
-
-
 PART = EvaluationPart(
     name="detector",
     stage="metrics",
@@ -272,5 +228,9 @@ PART = EvaluationPart(
     budget_minutes=7.4,
     measure=measure,
     flat=flat,
-    print_tables=print_tables,
-)
+    columns=(
+        *FIGURES, "grip_slip_mm", "pose_true_mm", "pose_stated_mm", "verdict_coverage_body",
+        "verdict_coverage_hands", "verdict_coverage_object",
+    ),
+    areas=("detector",),
+)  # fmt: skip

@@ -23,17 +23,15 @@ from bench.evaluate.part import (
     Measured,
     config_files,
     keyed,
-    number,
     truth_of,
 )
 from bench.workflow_speed import time_hold_out
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict.figures import TRUE, stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES, JOINT, SCENE, TRUTH
 from intercap_core.stages.export import MARKER
@@ -213,40 +211,6 @@ def _of_a_person_alone(sequence: FieldSequence) -> bool:
     return measured and sequence.exported_alone
 
 
-def print_field(evaluations: Sequence[FieldSequences]) -> None:
-    """Print one row per recording: true and stated errors, bone lengths, height."""
-    console = standard_console()
-    heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "body flagged %",
-             "bones %", "height mm", "subject %", "up deg", "stated")  # fmt: skip
-    table = ListTable("recording", *heads, title="the field, after metrics")
-    for found in evaluations:
-        for e in found.errors:
-            cells = []
-            by_part = {error.part: error for error in stated_errors(e.metrics)}
-            for part in TRUE:  # a person alone has no object
-                error = by_part.get(part)
-                pair = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
-                cells += pair or ["", ""]
-            table.add_row(
-                f"{found.dataset}: {e.metrics.name}",
-                *cells,
-                number(100 * e.metrics.flags.shares()["body"], 0),
-                number(100 * float(np.abs(e.bones).mean()), 1),
-                number(1e3 * e.height_m, 0),
-                number(100 * e.subject_right, 0),
-                *(
-                    ["", ""]
-                    if e.up is None
-                    else [number(e.up.error_deg, 1), number(e.up.stated_deg, 1)]
-                ),
-            )
-        for name in found.missing:
-            table.add_row(f"{found.dataset}: {name}", "no metrics")
-    console.print(table)
-    for key, value in flat(evaluations).items():
-        print(f"{key}: {value:.3g}")
-
-
 PART = EvaluationPart(
     name="field",
     stage="metrics",
@@ -259,7 +223,12 @@ PART = EvaluationPart(
     budget_minutes=12.5,
     measure=measure,
     flat=flat,
-    print_tables=print_field,
+    columns=(
+        "verdict.coverage_body", "verdict.coverage_hands", "verdict.coverage_object", "pve_mm",
+        "bone_percent", "height_mm", "subject_right_share", "people_alone_share", "up_error_deg",
+        "up_stated_deg",
+    ),
+    areas=("field",),
     last=last_stage,
     timed=seconds,
-)
+)  # fmt: skip

@@ -35,12 +35,8 @@ class FieldScene:
     is how much older it is than the time of its frame set, relative to the master's delay.
     """
 
-    sequence: str
-    """Name of the sequence."""
     fps: float
     """Frame sets per second."""
-    apart_s: np.ndarray
-    """(N,) true delay, median over images, seconds."""
     late_s: np.ndarray
     """(N,) error of the estimated delay, median over images, seconds."""
     sigma_s: np.ndarray
@@ -91,7 +87,6 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
                 (true["slip"][at][:, order], true["time_offset"][order]),
             )
         )
-        apart = np.nanmedian(true_late, axis=0)
         error = np.nanmedian(late - true_late, axis=0)
         unseen = np.asarray((found["image_of"] < 0).all(axis=0))
         named = np.array([NOT_DETERMINED in note for note in found.text("note")])
@@ -110,9 +105,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
         )
         counted = available.any(axis=0) & (np.arange(len(names)) != master)
         return FieldScene(
-            str(found.attributes["sequence"]),
             fps,
-            (apart - apart[master])[counted],
             (error - error[master])[counted],
             found["time_offset_sigma"][counted],
             (unseen | named)[counted],

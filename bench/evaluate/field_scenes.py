@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from bench.evaluate import field_errors
 from bench.evaluate.faulty_rigs import name_faults
 from bench.evaluate.field_errors import FieldScene
@@ -20,11 +18,9 @@ from bench.evaluate.part import (
     Measured,
     config_files,
     keyed,
-    number,
     truth_of,
 )
 from bench.evaluate.start_windows import Recording, measure_windows, window_figures
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
@@ -68,38 +64,6 @@ def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
     return [e for found in evaluations if found.dataset.startswith(cause) for e in found.errors]
 
 
-def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
-    """Print one row per recording."""
-    console = standard_console()
-    heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
-             "floor mm", "deg")  # fmt: skip
-    table = ListTable("recording", *heads, title="the field, after scene")
-    for found in evaluations:
-        for e in found.errors:
-            table.add_row(
-                f"{found.dataset}: {e.sequence}",
-                _list(e.apart_s, 2),
-                _list(1e3 * e.late_s, 1),
-                _list(1e3 * e.sigma_s, 1),
-                str(int(e.set_aside.sum())),
-                number(1e3 * float(e.before.mean()), 1),
-                number(1e3 * float(e.after.mean()), 1),
-                number(1e3 * float(np.median(e.stated)), 1),
-                str(int(e.worse.sum())),
-                number(1e3 * e.floor_m, 1) or "-",
-                number(e.tilt_deg, 2) or "-",
-            )
-        for name in found.missing:
-            table.add_row(f"{found.dataset}: {name}", "no scene")
-    console.print(table)
-    for key, value in flat(evaluations).items():
-        print(f"{key}: {value:.3g}")
-
-
-def _list(values: np.ndarray, digits: int) -> str:
-    return " ".join(number(float(value), digits) or "-" for value in values)
-
-
 PART = EvaluationPart(
     name="field_scenes",
     stage="scene",
@@ -107,5 +71,10 @@ PART = EvaluationPart(
     budget_minutes=6.6,
     measure=measure,
     flat=flat,
-    print_tables=print_scenes,
-)
+    columns=(
+        "offset_error_worst_ms", "offset_wrong", "extrinsics_floor_heavy_mm",
+        "extrinsics_floor_heavy_worst_mm", "extrinsics_worse_cameras", "floor_missing",
+        "floor_mm", "tilt_deg", "moved_camera_named_share", "moved_camera_false_alarms",
+    ),
+    areas=("field",),
+)  # fmt: skip

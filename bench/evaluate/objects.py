@@ -12,15 +12,13 @@ from bench.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
-    add_rows,
     config_files,
+    grouped,
     keyed,
-    number,
     truth_of,
     variant,
     with_spread,
 )
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -30,14 +28,6 @@ Objects = Measured[ObjectErrors]
 AREA = "object"
 # The dataset ``object`` and its copies with other random errors of the detector
 REDRAWN = re.compile(rf"{AREA}(_redrawn\d+)?")
-_COLUMNS = {
-    "mm": ("translation_median_mm", 1), "p95": ("translation_p95_mm", 1),
-    "deg": ("rotation_median_deg", 2), "p95 deg": ("rotation_p95_deg", 1),
-    "ADD-S": ("add_s_recall", 2), "MSSD": ("mssd_recall", 2), "first": ("first_frame_success", 2),
-    "lost": ("lost_share", 3), "unseen": ("lost_unnoticed_share", 3),
-    "flagged": ("flagged_share", 2), "rest mm": ("rest_jitter_mm", 2),
-    "rest deg": ("rest_jitter_deg", 2), "onset": ("motion_onset_frames", 1),
-}  # fmt: skip
 
 
 def measure(project: Project, sequence: str) -> ObjectErrors:
@@ -50,12 +40,6 @@ def measure(project: Project, sequence: str) -> ObjectErrors:
     return track_errors.measure(paths.scene, paths.object_track, truth, mesh)
 
 
-def by_object(errors: Sequence[ObjectErrors]) -> dict[str, list[ObjectErrors]]:
-    """The recordings of each object, by name."""
-    names = sorted({e.object_ for e in errors})
-    return {name: [e for e in errors if e.object_ == name] for name in names}
-
-
 def flat(evaluations: Sequence[Objects]) -> Figures:
     """Keys ``object.lost_share``, ``object.cup.lost_share``, ``object.views_2.lost_share``.
 
@@ -65,7 +49,7 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
     for tracked in evaluations:
         start = variant(tracked.dataset, AREA)
         found[f"{AREA}.{start}recordings"] = float(len(tracked.errors))
-        for group, errors in {"": tracked.errors, **by_object(tracked.errors)}.items():
+        for group, errors in {"": tracked.errors, **grouped(tracked.errors, "object_")}.items():
             figures = with_spread(object_errors.figures, errors)
             found |= keyed(f"{AREA}.{group}{'.' if group else ''}{start}", figures)
         for views, figures in track_errors.by_views(tracked.errors).items():
@@ -83,41 +67,13 @@ def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
 
     Only objects that all draws have; empty if there is only one draw.
     """
-    draws = [by_object(e.errors) for e in evaluations if REDRAWN.fullmatch(e.dataset)]
+    draws = [grouped(e.errors, "object_") for e in evaluations if REDRAWN.fullmatch(e.dataset)]
     if len(draws) < 2:
         return {}
     return {
         name: [float(np.mean(np.concatenate([e.lost for e in draw[name]]))) for draw in draws]
         for name in sorted(set.intersection(*(set(draw) for draw in draws)))
     }
-
-
-def print_objects(evaluations: Sequence[Objects]) -> None:
-    """Print for each project a table by object and a table by number of views."""
-    console = standard_console()
-    for found in evaluations:
-        table = ListTable("object", *_COLUMNS)
-        table.title = f"{found.dataset}: objects against truth, after object_track"
-        for name, errors in by_object(found.errors).items():
-            add_rows(table, name, object_errors.figures(errors), _COLUMNS)
-        add_rows(table, "all", with_spread(object_errors.figures, found.errors), _COLUMNS)
-        for name in found.missing:
-            table.add_row(f"{name}: no track")
-        console.print(table)
-        table = ListTable("views that see it", "frames", "mm", "deg", "lost")
-        for name, figures in track_errors.by_views(found.errors).items():
-            digits = (0, 1, 2, 3)
-            table.add_row(
-                name, *(number(v, d) for v, d in zip(figures.values(), digits, strict=True))
-            )
-        console.print(table)
-    drawn = lost_by_draw(evaluations)
-    if drawn:
-        table = ListTable("object", "lost, redrawn detections", "spread")
-        for name, shares in drawn.items():
-            each = "  ".join(number(share, 3) for share in shares)
-            table.add_row(name, each, number(max(shares) - min(shares), 3))
-        console.print(table)
 
 
 def has_object(project: Project, sequence: str) -> bool:
@@ -132,6 +88,10 @@ PART = EvaluationPart(
     budget_minutes=7.4,
     measure=measure,
     flat=flat,
-    print_tables=print_objects,
+    columns=(
+        "translation_median_mm", "translation_p95_mm", "rotation_median_deg", "rotation_p95_deg",
+        "lost_share", "lost_unnoticed_share",
+    ),
+    areas=(AREA,),
     has=has_object,
-)
+)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Common code of the parts of an evaluation: measure recordings, print tables."""
+"""Common code of the parts of an evaluation: measure recordings, combine their figures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from rich.table import Table
 
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
@@ -20,9 +19,9 @@ from intercap_core.project import Project, load_project
 Errors = TypeVar("Errors")
 Figures = dict[str, float]
 Targets = Sequence[tuple[str, Project]]  # last stage and project
-Columns = Mapping[str, tuple[str, int]]  # heading of a column to a figure's key and digits
 
 SPREAD = "_spread"  # suffix of the standard error of a figure
+COMPARED = "compared_"  # prefix of figures over the recordings that variants share
 # Figures without a standard error, like those whose key contains "worst"
 COUNTS = (
     "frames", "captures", "slips_true", "slips_missed", "slips_false", "object_worse_count",
@@ -39,8 +38,8 @@ class Measured(Generic[Errors]):
     """Errors of each recording that has an artefact of the stage."""
     missing: Sequence[str] = ()
     """Names of the recordings without one."""
-    rig: str = ""
-    """Description of the cameras and data that the settings select."""
+    names: Sequence[str] = ()
+    """Names of the recordings of ``errors``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,10 +59,13 @@ class EvaluationPart(Generic[Errors]):
     """Measures the errors of (project, sequence)."""
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
     """Returns the figures of all projects, keys ``area.measure``."""
-    print_tables: Callable[[Sequence[Measured[Errors]]], None]
-    """Prints the tables of all projects."""
-    rig: Callable[[Project], str] = lambda _: ""
-    """Describes the cameras and data that a project's settings select."""
+    columns: Sequence[str]
+    """Figures of single recordings that are printed: ``measure``, or ``area.measure`` if several
+    areas have the measure."""
+    areas: Sequence[str] = ()
+    """Areas whose datasets have variants, see :func:`variant`."""
+    problems: Callable[[Errors], Sequence[str]] = lambda _: ()
+    """Returns the reasons why figures of a recording are missing."""
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
     """Whether (project, sequence) has the measured quantity."""
     last: Callable[[Project], str | None] = lambda _: None
@@ -112,7 +114,7 @@ class EvaluationPart(Generic[Errors]):
                 project.config.dataset,
                 [next(errors) for _ in own],
                 [name for name in all_names if name not in own],
-                self.rig(project),
+                own,
             )
             for project, all_names, own in zip(projects, wanted, names, strict=True)
         ]
@@ -169,6 +171,12 @@ def variant(dataset: str, *areas: str) -> str:
     return f"{name}_" if name else ""
 
 
+def grouped(recordings: Sequence[Errors], name: str) -> dict[str, list[Errors]]:
+    """The recordings by the value of their attribute ``name``, sorted."""
+    values = sorted({getattr(recording, name) for recording in recordings})
+    return {value: [r for r in recordings if getattr(r, name) == value] for value in values}
+
+
 def keyed(prefix: str, figures: Mapping[str, float]) -> Figures:
     """The figures with ``prefix`` before each key."""
     return {f"{prefix}{key}": value for key, value in figures.items()}
@@ -193,21 +201,6 @@ def with_spread(
         for key, values in samples.items()
         if len(values) > 1
     }
-
-
-def add_rows(
-    table: Table,
-    name: str,
-    figures: Mapping[str, float],
-    columns: Columns,
-    cells: Sequence[str] = (),
-) -> None:
-    """Add a row of ``cells`` and ``figures``, and one of their standard errors if there are any."""
-    row = (number(figures.get(key), digits) for key, digits in columns.values())
-    table.add_row(name, *cells, *row)
-    if any(key + SPREAD in figures for key, _ in columns.values()):
-        row = (number(figures.get(key + SPREAD), digits) for key, digits in columns.values())
-        table.add_row("  +-", *("" for _ in cells), *row)
 
 
 def number(value: float | None, digits: int) -> str:

@@ -18,16 +18,14 @@ from bench.evaluate.part import (
     Measured,
     config_files,
     keyed,
-    number,
     truth_of,
     with_spread,
 )
+from bench.evaluate.rig_errors import ChainErrors, RigErrors, figures, pose_errors
 from intercap_core.calibrate.draft import draft_rig
 from intercap_core.calibrate.rig_poses import find_poses
 from intercap_core.commands.calibrate import record
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
-from intercap_core.evaluation.rig_errors import ChainErrors, RigErrors, figures, pose_errors
 from intercap_core.formats.calibration.boards import parse_board
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.rig import Rig
@@ -99,11 +97,11 @@ def _errors(
             background=background,
         )
     except UserError as error:
-        return RigErrors(sequence, evidence, np.zeros(0), np.zeros(0), str(error))
+        return RigErrors(evidence, np.zeros(0), np.zeros(0), str(error))
     poses = found.rig.master_from_colour
     errors = pose_errors(truth_of(project, sequence), found.rig.names, poses)
     sigma = np.array([found.sigma_m(c) for c in range(1, len(found.rig))])
-    rig = RigErrors(sequence, evidence, errors, sigma)
+    rig = RigErrors(evidence, errors, sigma)
     if evidence != "person_depth" or not project.sequences[sequence].object:
         return rig
     try:
@@ -145,27 +143,6 @@ def flat(evaluations: Sequence[Rigs]) -> Figures:
     return found
 
 
-def print_rigs(evaluations: Sequence[Rigs]) -> None:
-    """Print a table with a row per calibration."""
-    console = standard_console()
-    table = ListTable(
-        "recording", "by", "error mm", "worst", "estimated", "body mm", "object mm", "",
-        title="poses without a calibration; all stages with given > found poses",
-    )  # fmt: skip
-    for found in evaluations:
-        for rig in (rig for recording in found.errors for rig in recording):
-            error, sigma = 1e3 * rig.error, 1e3 * rig.sigma
-            cells = (
-                [number(float(v), 1) for v in (error.mean(), error.max(), sigma.mean())]
-                if len(error)
-                else [""] * 3
-            )
-            chain = ("", "") if rig.chain is None else (rig.chain.body, rig.chain.object_)
-            cells += [" > ".join(number(1e3 * float(v), 1) for v in both) for both in chain]
-            table.add_row(rig.sequence, rig.evidence, *cells, rig.problem)
-    console.print(table)
-
-
 PART = EvaluationPart(
     name="rig",
     stage="detections",
@@ -173,5 +150,11 @@ PART = EvaluationPart(
     budget_minutes=6.5,
     measure=measure,
     flat=flat,
-    print_tables=print_rigs,
-)
+    columns=(
+        *(f"pose_{name}_mm" for name in ("person_depth", "person_colour", "board", "background")),
+        "error_over_estimate_median",
+        "body_pve_ratio",
+        "object_ratio",
+    ),
+    problems=lambda rigs: [f"{rig.evidence}: {rig.problem}" for rig in rigs if rig.problem],
+)  # fmt: skip

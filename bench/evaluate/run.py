@@ -22,7 +22,7 @@ from bench.evaluate import (
     sequences,
 )
 from bench.evaluate.constants import total_constants
-from bench.evaluate.part import EvaluationPart, Figures, require_truth
+from bench.evaluate.part import EvaluationPart, Figures, keyed, require_truth
 from bench.evaluate.reference import (
     REFERENCE,
     passes_gate,
@@ -30,10 +30,10 @@ from bench.evaluate.reference import (
     update_reference,
 )
 from bench.evaluate.seeds import redraw_settings
+from bench.evaluate.tables import print_figures, print_part
 from bench.evaluate.workflows import (
     bring_up_to_date,
     minutes_of_parts,
-    print_minutes,
 )
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import calibration_readers
@@ -69,7 +69,7 @@ def evaluate(
     cores: int = 0,
     seed: int | None = None,
 ) -> int:
-    """Bring the evaluation's recordings up to date, print the tables and write the figures.
+    """Bring the evaluation's recordings up to date, write the figures and print them as tables.
 
     Returns 1 if a stage failed; recordings that failed are excluded from the figures and named.
     Raises UserError if a project's settings are wrong or none of its sequences has a result.
@@ -103,20 +103,25 @@ def evaluate(
     for name, some in projects.items():
         part = PARTS[name]
         measured = part.measure_all(some, workers=workers)
-        part.print_tables(measured)
-        figures |= part.flat(measured) | part.time_one(some)
+        own = part.flat(measured) | part.time_one(some)
+        figures |= own
+        _write(figures, output)  # before the next part, which may fail
+        print_part(part, measured, own)
     minutes = minutes_of_parts(wanted)
     minutes |= {f"{name}_minutes_budget": PARTS[name].budget_minutes for name in wanted}
-    duration = (time.monotonic() - begin) / 60
-    print_minutes(list(projects), minutes, duration)
-    figures |= {"constants.total": total_constants()} | format_counts()
-    print(f"constants of the package: {figures['constants.total']}")
-    figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
-    flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    minutes["minutes"] = (time.monotonic() - begin) / 60
+    of_run = keyed("time.", minutes) | {"constants.total": total_constants()} | format_counts()
+    _write(figures | of_run, output)
+    print_figures(dict(sorted(of_run.items())))
     print(output)
     return status
+
+
+def _write(figures: Figures, output: Path) -> None:
+    """Write the finite figures with six significant digits."""
+    flat = {key: float(f"{value:.6g}") for key, value in figures.items() if math.isfinite(value)}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def format_counts() -> Figures:

@@ -20,17 +20,12 @@ from bench.evaluate.part import (
     Figures,
     Measured,
     config_files,
+    grouped,
     keyed,
-    number,
     truth_of,
     with_spread,
 )
-from intercap_core import artefacts
-from intercap_core.commands.console import ListTable, standard_console
-from intercap_core.commands.scan import scan
-from intercap_core.entries import ObjectEntry
-from intercap_core.errors import UserError
-from intercap_core.evaluation.scan_errors import (
+from bench.evaluate.scan_errors import (
     Mesh,
     ScanErrors,
     TrackErrors,
@@ -38,6 +33,10 @@ from intercap_core.evaluation.scan_errors import (
     distances,
     figures,
 )
+from intercap_core import artefacts
+from intercap_core.commands.scan import scan
+from intercap_core.entries import ObjectEntry
+from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project
 from intercap_core.schemas import HAND_HELD_TRUTH, TRUTH
@@ -90,7 +89,7 @@ def measure(project: Project, sequence: str) -> ScanErrors:
         )  # fmt: skip
     except UserError as error:
         nothing = np.zeros(0)
-        return ScanErrors(sequence, entry.name, nothing, nothing, problem=str(error), way=way)
+        return ScanErrors(entry.name, nothing, nothing, problem=str(error), way=way)
     scanned = Mesh(found.vertices, found.faces)
     aligned = scanned.moved(align(scanned, truth))
     in_true_frame = path.with_name(f"{sequence}_aligned.ply")
@@ -103,7 +102,7 @@ def measure(project: Project, sequence: str) -> ScanErrors:
         and way_of(project, other) not in (TURNED, STILL)
     ]
     return ScanErrors(
-        sequence, entry.name, *distances(aligned, truth), scanned.is_watertight, tracks=tracks,
+        entry.name, *distances(aligned, truth), scanned.is_watertight, tracks=tracks,
         way=way, before=before,
     )  # fmt: skip
 
@@ -128,16 +127,10 @@ def _track_errors(
         found = track_errors.measure(paths.scene, output, truth_of(project, sequence), mesh)
         assert found.mssd is not None
         errors.append(found.mssd * mesh.diameter)
-    return TrackErrors(sequence, *errors)
+    return TrackErrors(*errors)
 
 
 Scans = Measured[ScanErrors]
-
-
-def by_object(errors: Sequence[ScanErrors]) -> dict[str, list[ScanErrors]]:
-    """The scans of each object, by name."""
-    names = sorted({e.object_ for e in errors})
-    return {name: [e for e in errors if e.object_ == name] for name in names}
 
 
 def flat(evaluations: Sequence[Scans]) -> Figures:
@@ -149,33 +142,9 @@ def flat(evaluations: Sequence[Scans]) -> Figures:
         some = [error for error in errors if error.way == way]
         prefix = f"{AREA}." if way == TURNED else f"{AREA}.{way}."
         result |= keyed(prefix, with_spread(figures, some))
-    for name, some in by_object([e for e in errors if e.way == TURNED]).items():
+    for name, some in grouped([e for e in errors if e.way == TURNED], "object_").items():
         result |= keyed(f"{AREA}.{name}.", with_spread(figures, some))
     return result
-
-
-def print_scans(evaluations: Sequence[Scans]) -> None:
-    """Print a table with a row per scan."""
-    console = standard_console()
-    table = ListTable(
-        "object", "way", "before mm", "chamfer mm", "p95 mm", "watertight", "track ratio", "",
-        title="scanned meshes",
-    )  # fmt: skip
-    for found in evaluations:
-        for error in sorted(found.errors, key=lambda e: e.object_):
-            values = figures([error])
-            closed = "yes" if error.watertight else "no"
-            table.add_row(
-                error.object_,
-                error.way,
-                number(values.get("before_mm"), 2),
-                number(values.get("chamfer_mm"), 2),
-                number(values.get("p95_mm"), 2),
-                closed if len(error.to_truth) else "",
-                number(values.get("object_ratio"), 2),
-                error.problem,
-            )
-    console.print(table)
 
 
 PART = EvaluationPart(
@@ -185,7 +154,8 @@ PART = EvaluationPart(
     budget_minutes=16.5,  # measured alone, on two cores without other jobs (bench/RESULTS.md)
     measure=measure,
     flat=flat,
-    print_tables=print_scans,
+    columns=("before_mm", "chamfer_mm", "p95_mm", "watertight_share", "object_ratio"),
+    problems=lambda error: [error.problem] if error.problem else [],
     last=last_stage,
     has=lambda project, sequence: bool(way_of(project, sequence)),
 )

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.evaluate.part import grouped
 from intercap_core.evaluation import contact, motion
 from intercap_core.evaluation.contact_figures import RELIABILITY_BINS, reliability, stated_and_true
 from intercap_core.evaluation.figures import (
@@ -111,8 +112,8 @@ def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 def slip_by_object(sequences: Sequence[SequenceMetrics], stage: str) -> dict[str, float]:
     """Mean slip over the frames with true contact, by object, mm/s."""
     found = {}
-    for name in sorted({s.object_ for s in sequences}):
-        slip = pooled([s for s in sequences if s.object_ == name], f"truth/{stage}/slip")
+    for name, some in grouped(sequences, "object_").items():
+        slip = pooled(some, f"truth/{stage}/slip")
         if slip is not None and np.isfinite(slip).any():
             found[name] = 1e3 * float(np.nanmean(slip))
     return found
@@ -137,8 +138,7 @@ def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
         "object_rotation_p95_deg": 0.1,
     }
     worse = []
-    for name in sorted({s.object_ for s in sequences if s.has_truth}):
-        some = [s for s in sequences if s.has_truth and s.object_ == name]
+    for name, some in grouped([s for s in sequences if s.has_truth], "object_").items():
         before, after = (object_figures(some, stage) for stage in ("object_track", "joint"))
         if any(
             after[key] - before[key] > max(0.05 * before[key], limit)

@@ -9,17 +9,15 @@ import numpy as np
 
 from bench.evaluate import sequence_figures
 from bench.evaluate.part import (
-    SPREAD,
     EvaluationPart,
     Figures,
     Measured,
     config_files,
-    number,
+    grouped,
     truth_of,
     with_spread,
 )
 from bench.evaluate.through_wall import count_behind_wall
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.at_truth import displacements
@@ -45,19 +43,6 @@ ALSO = {
     "object_translation_median_mm": ("joint", "object_translation_mm"),
     "contact_vertex_f1": ("joint", "contact_f1"),
     "penetration_mean_mm": ("penetration", "mean_mm"),
-}
-# Columns of the table by object: sequential stage and figure that are compared with ``joint``
-BY_OBJECT = {
-    "body mm": ("body_fit", "body_pve_mm"),
-    "grasp mm": ("body_fit", "hand_grasp_mpjpe_mm"),
-    "tips mm": ("body_fit", "fingertip_touching_mm"),
-    "slip mm/s": ("body_fit", "slip_mm_s"),
-    "planted mm/s": ("body_fit", "planted_mm_s"),
-    "object mm": ("object_track", "object_translation_mm"),
-    "p95": ("object_track", "object_translation_p95_mm"),
-    "turn deg": ("object_track", "object_rotation_deg"),
-    "p95 ": ("object_track", "object_rotation_p95_deg"),
-    "contact F1": ("body_fit", "contact_f1"),
 }
 Areas = dict[str, Figures]
 
@@ -144,20 +129,16 @@ def _extra_joint_figures(sequences: Sequence[SequenceMetrics], found: Areas) -> 
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
         slips = sequence_figures.slip_by_object(sequences, stage)
         extra |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
-    for name, some in _by_object(sequences).items():
+    by_object = grouped([s for s in sequences if s.object_], "object_")
+    for name, some in by_object.items():
         turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
         if turn is not None:
             extra[f"{name}.object_rotation_p95_deg"] = turn
-    depths = [figures.penetration_figures(some) for some in _by_object(sequences).values()]
+    depths = [figures.penetration_figures(some) for some in by_object.values()]
     deepest = [found["mean_mm"] for found in depths if np.isfinite(found.get("mean_mm", np.nan))]
     if deepest:
         extra["penetration_worst_object_mm"] = max(deepest)
     return extra
-
-
-def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceMetrics]]:
-    names = sorted({s.object_ for s in sequences if s.object_})
-    return {name: [s for s in sequences if s.object_ == name] for name in names}
 
 
 def flat_areas(sequences: Sequence[SequenceMetrics]) -> Figures:
@@ -190,49 +171,6 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
     return found
 
 
-def print_sequences(evaluations: Sequence[Sequences]) -> None:
-    """Print a table of the three stages, one of the other areas, and one by object."""
-    console = standard_console()
-    found = {name: with_spread(flat_areas, some) for name, some in groups(evaluations).items()}
-    keys = dict.fromkeys(key for figures in found.values() for key in figures)
-    keys = dict.fromkeys(key for key in keys if not key.endswith(SPREAD))
-    measures = [key.partition(".")[2] for key in keys if key.partition(".")[0] in ESTIMATES]
-    for group, some in groups(evaluations).items():
-        table = ListTable("measure", *ESTIMATES)
-        table.title = f"against truth, {group} ({len(some)} sequences, +- standard error)"
-        for measure in dict.fromkeys(measures):
-            table.add_row(measure, *(_cell(found[group], f"{s}.{measure}") for s in ESTIMATES))
-        console.print(table)
-    table = ListTable("after joint", *found, title="all frames (+- standard error)")
-    for key in keys:
-        if key.partition(".")[0] not in ESTIMATES:
-            table.add_row(key, *(_cell(figures, key) for figures in found.values()))
-    console.print(table)
-    for group, some in groups(evaluations).items():
-        table = ListTable("object", *BY_OBJECT, "stated F1", "penetration mm")
-        table.title = f"sequential fits > joint, {group}"
-        for name, of_object in _by_object(some).items():
-            table.add_row(name, *_row(areas(of_object)))
-        console.print(table)
-    for name in (name for measured in evaluations for name in measured.missing):
-        print(f"{name}: no metrics")
-
-
-def _row(found: Areas) -> list[str]:
-    joint = found["joint"]
-    cells = [
-        f"{number(found[stage].get(measure), 2)} > {number(joint.get(measure), 2)}"
-        for stage, measure in BY_OBJECT.values()
-    ]
-    stated = number(joint.get("contact_detected_f1"), 2)
-    return [*cells, stated, number(joint.get("penetration_mean_mm"), 1)]
-
-
-def _cell(column: Figures, name: str) -> str:
-    error = number(column.get(name + SPREAD), 3)
-    return number(column.get(name), 3) + (f" +- {error}" if error else "")
-
-
 PART = EvaluationPart(
     name="sequences",
     stage="metrics",
@@ -240,5 +178,10 @@ PART = EvaluationPart(
     budget_minutes=16.3,
     measure=measure,
     flat=flat,
-    print_tables=print_sequences,
-)
+    columns=(
+        "joint.body_pve_mm", "joint.hand_mpjpe_mm", "joint.fingertip_touching_mm",
+        "joint.object_translation_mm", "joint.object_rotation_deg", "joint.contact_detected_f1",
+        "joint.slip_mm_s", "joint.planted_mm_s", "joint.penetration_mean_mm",
+        "extrinsics.joint_mean_mm",
+    ),
+)  # fmt: skip

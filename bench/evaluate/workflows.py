@@ -21,7 +21,6 @@ from rich.console import Console
 
 from bench.evaluate.part import Figures, Targets
 from intercap_core.commands.check import check_bodies
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import POLL_SECONDS, snakemake_command
 from intercap_core.commands.watcher import Watcher
 from intercap_core.errors import UserError
@@ -225,14 +224,3 @@ def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
         f"{part}_minutes_taken": sum(job.seconds() for job in jobs) / (2 * 60)
         for part, jobs in jobs_by_part(parts).items()
     }
-
-
-def print_minutes(parts: Sequence[str], minutes: Figures, duration: float) -> None:
-    """Print one row per part, and the ``duration`` of this run in minutes."""
-    table = ListTable("part", "budget", "taken", title="minutes on 2 cores")
-    for part in parts:
-        budget, taken = (minutes[f"{part}_minutes_{key}"] for key in ("budget", "taken"))
-        excess = "over its budget" if taken > budget else ""
-        table.add_row(part, f"{budget:.1f}", f"{taken:.1f}", excess)
-    standard_console().print(table)
-    print(f"this run took {duration:.1f} minutes of wall time")

@@ -80,7 +80,7 @@ def _errors(room: str = "furnished", **values: object) -> CaptureErrors:
         "slips": SlipCounts(found=2, missed=0, false=0, images_wrong=1, images=100),
         "ground_m": 0.002, "ground_deg": 0.1, "depth_bias": np.array([0.001, -0.001, np.nan]),
     }  # fmt: skip
-    return CaptureErrors("a", room, **(known | values))
+    return CaptureErrors(room, **(known | values))
 
 
 def test_figures_of_several_captures() -> None:

@@ -25,7 +25,6 @@ from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 def _scene(fps: float, late_ms: list[float], **values: object) -> FieldScene:
     count = len(late_ms)
     made: dict[str, np.ndarray] = {
-        "apart_s": np.zeros(count),
         "sigma_s": np.full(count, 0.002),
         "set_aside": np.zeros(count, bool),
         "before": np.full(count, 0.010),
@@ -33,9 +32,7 @@ def _scene(fps: float, late_ms: list[float], **values: object) -> FieldScene:
         "stated": np.full(count, 0.003),
     }
     made |= {key: np.array(value) for key, value in values.items()}
-    return FieldScene(
-        "a", fps, late_s=1e-3 * np.array(late_ms), floor_m=0.004, tilt_deg=0.2, **made
-    )
+    return FieldScene(fps, late_s=1e-3 * np.array(late_ms), floor_m=0.004, tilt_deg=0.2, **made)
 
 
 def test_cameras_are_solved_within_half_a_set_or_named() -> None:

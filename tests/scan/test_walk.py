@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bench.evaluate.scan_errors import Mesh, align, distances
 from intercap_core.commands.scan import scan
 from intercap_core.errors import UserError
-from intercap_core.evaluation.scan_errors import Mesh, align, distances
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig

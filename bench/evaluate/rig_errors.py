@@ -88,7 +88,6 @@ def truth_from_rig(poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
 class RigErrors:
     """One calibration of one rig."""
 
-    sequence: str
     evidence: str
     """Key of the figures: person_depth, person_colour, board or background."""
     error: np.ndarray

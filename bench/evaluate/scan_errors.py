@@ -52,7 +52,6 @@ class Mesh:
 class TrackErrors:
     """Errors of a tracked object over T frames with one mesh: MSSD, metres; inf = lost."""
 
-    sequence: str
     given: np.ndarray
     """(T,) with the mesh of objects.yaml."""
     scanned: np.ndarray
@@ -63,7 +62,6 @@ class TrackErrors:
 class ScanErrors:
     """Errors of one scanned object."""
 
-    sequence: str
     object_: str
     to_truth: np.ndarray
     """(N,) distances of points of the scan from the true surface, metres; empty without a scan."""

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.evaluation.scan_errors import (
+from bench.evaluate.scan_errors import (
     Mesh,
     ScanErrors,
     TrackErrors,
@@ -29,7 +29,7 @@ def _sphere(radius: float) -> Mesh:
 
 def _errors(scan: Mesh, truth: Mesh, name: str = "cup") -> ScanErrors:
     aligned = scan.moved(align(scan, truth))
-    return ScanErrors(name, name, *distances(aligned, truth), scan.is_watertight)
+    return ScanErrors(name, *distances(aligned, truth), scan.is_watertight)
 
 
 def test_concentric_spheres_are_apart_by_the_difference_of_their_radii() -> None:
@@ -66,10 +66,10 @@ def test_noise_and_a_missing_handle_appear_in_the_distances() -> None:
 
 def test_figures_are_means_over_objects_and_a_geometric_mean_of_ratios() -> None:
     def scan(size: float, *ratios: float) -> ScanErrors:
-        tracks = [TrackErrors("a", np.full(5, 0.004), np.full(5, 0.004 * r)) for r in ratios]
-        return ScanErrors("a", "cup", np.full(4, size), np.full(4, 3 * size), True, "", tracks)
+        tracks = [TrackErrors(np.full(5, 0.004), np.full(5, 0.004 * r)) for r in ratios]
+        return ScanErrors("cup", np.full(4, size), np.full(4, 3 * size), True, "", tracks)
 
-    failed = ScanErrors("b", "chair", np.zeros(0), np.zeros(0), problem="not seen")
+    failed = ScanErrors("chair", np.zeros(0), np.zeros(0), problem="not seen")
     found = figures([scan(0.001, 1.0, 2.0), scan(0.003, 4.0), failed])
     assert found == pytest.approx(
         {

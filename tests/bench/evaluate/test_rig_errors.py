@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.rig_errors import ChainErrors, RigErrors, figures, truth_from_rig
+from bench.evaluate.rig_errors import ChainErrors, RigErrors, figures, truth_from_rig
 from intercap_core.geometry.camera.transforms import invert, rigid, rotation_exp
 from tests.calibrate.plain_project import small_ring
 
@@ -30,12 +30,12 @@ def test_the_ratio_is_the_median_over_recordings() -> None:
     chains = [((8, 8), (2, 3)), ((10, 11), (2, 2)), ((5, 10), (4, 2))]
     rigs = [
         RigErrors(
-            "a", "person_depth", np.ones(2), np.ones(2),
+            "person_depth", np.ones(2), np.ones(2),
             chain=ChainErrors(*(1e-3 * np.array(part, float) for part in chain)),
         )
         for chain in chains
     ]  # fmt: skip
-    found = figures([*rigs, RigErrors("b", "board", np.ones(2), np.ones(2))])
+    found = figures([*rigs, RigErrors("board", np.ones(2), np.ones(2))])
     assert found["body_pve_ratio"] == pytest.approx(1.1)
     assert found["object_ratio"] == pytest.approx(1.0)
-    assert "body_pve_ratio" not in figures([RigErrors("b", "board", np.ones(2), np.ones(2))])
+    assert "body_pve_ratio" not in figures([RigErrors("board", np.ones(2), np.ones(2))])
