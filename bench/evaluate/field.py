@@ -146,8 +146,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
     """Keys ``field.<measure>`` and ``verdict.<measure>``."""
     every = [e.metrics for found in evaluations for e in found.errors]
     found = keyed("verdict.", verdict_figures(every))
-    bad = figures.bad_frame_figures([m for m in every if m.has_truth])
-    found |= keyed("verdict.", bad) | keyed("field.", bad)
+    found |= keyed("verdict.", figures.bad_frame_figures([m for m in every if m.has_truth]))
     for dataset, name in ((NO_DEPTH, "no_depth"), (BUILDS, "builds"), (SHOES, "shoes")):
         some = [e for found in evaluations if found.dataset == dataset for e in found.errors]
         found |= keyed(f"field.{name}_", _of_bodies(some)) if some else {}
