@@ -7,7 +7,6 @@ The reference is the dataset named ``object`` (or ``body``). Datasets such as ``
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from bench.evaluate import body_errors
 from bench.evaluate.body_errors import BodyErrors
@@ -41,33 +40,6 @@ def measure(project: Project, sequence: str) -> BodyErrors:
     )
 
 
-class _Projects(NamedTuple):
-    """The evaluated projects, by their recordings."""
-
-    reference: Bodies | None
-    """The project that is not a variant."""
-    separate: list[Bodies]
-    """The reference and the variants with recordings of their own."""
-    reduced: list[Bodies]
-    """Variants that use recordings of the reference with fewer views or less data."""
-    compared: list[BodyErrors]
-    """Errors of the reference in the recordings of ``reduced``."""
-
-
-def _sort(evaluations: Sequence[Bodies]) -> _Projects:
-    """Sort the projects by whether they have the recordings of the reference."""
-    reference = next((e for e in evaluations if not _variant(e)), None)
-    known = {e.truth for e in reference.errors} if reference else set()
-    separate: list[Bodies] = []
-    reduced: list[Bodies] = []
-    for project in evaluations:
-        own = project is reference or not {e.truth for e in project.errors} <= known
-        (separate if own else reduced).append(project)
-    shared = {e.truth for project in reduced for e in project.errors}
-    compared = [e for e in reference.errors if e.truth in shared] if reference else []
-    return _Projects(reference, separate, reduced, compared)
-
-
 def _variant(evaluation: Bodies) -> str:
     return variant(evaluation.dataset, AREA, *OTHER_AREAS)
 
@@ -80,20 +52,27 @@ def flat(evaluations: Sequence[Bodies]) -> Figures:
     a variant, over the recordings that variants also evaluate.
     """
     found: Figures = {}
-    projects = _sort(evaluations)
+    reference = next((e for e in evaluations if not _variant(e)), None)
+    known = {e.truth for e in reference.errors} if reference else set()
+    # variants that use recordings of the reference with fewer views or less data
+    reduced = [
+        project
+        for project in evaluations
+        if project is not reference and {e.truth for e in project.errors} <= known
+    ]
     for evaluation in evaluations:
         start = _variant(evaluation)
         found[f"{AREA}.{start}recordings"] = float(len(evaluation.errors))
         found |= keyed(f"{AREA}.{start}", with_spread(body_errors.figures, evaluation.errors))
-        if evaluation is projects.reference:
+        if evaluation is reference:
             found |= keyed(f"{AREA}.", body_errors.joint_figures(evaluation.errors))
-        if evaluation in projects.separate:
+        if evaluation not in reduced:
             for name, recordings in grouped(evaluation.errors, "interaction").items():
                 found |= keyed(f"{AREA}.{name}.{start}", body_errors.figures(recordings))
-    if projects.compared:
-        compared = with_spread(body_errors.figures, projects.compared)
-        found |= keyed(f"{AREA}.{COMPARED}", compared)
-    if projects.reference is not None:
+    if reference is not None:
+        shared = {e.truth for project in reduced for e in project.errors}
+        compared = [e for e in reference.errors if e.truth in shared]
+        found |= keyed(f"{AREA}.{COMPARED}", with_spread(body_errors.figures, compared))
         every = body_errors.flag_figures([e for some in evaluations for e in some.errors])
         for key in _FLAGS:
             found.pop(f"{AREA}.{key}", None)

@@ -76,7 +76,7 @@ class TrueAndStated(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RigErrors:
+class CameraErrors:
     """Errors of the cameras' estimates; poses and offsets of all cameras but the master."""
 
     pose_mm: TrueAndStated
@@ -94,7 +94,7 @@ class DetectorSequence:
     metrics: SequenceMetrics
     slip_m: list[float]
     """Slip of each grip, see :func:`grip_slips`."""
-    rig: RigErrors
+    cameras: CameraErrors
     """Errors of the cameras after ``joint``."""
     windows: WindowErrors | None
     """Starts in windows of the recording; None = not measured, with simulated keypoints."""
@@ -120,12 +120,12 @@ def measure(project: Project, sequence: str) -> DetectorSequence:
         windows = measure_windows(Recording.read(paths.frames, paths.detections, truth))
     slips = _slips_of(paths.joint, truth, times, metrics.fps, symmetry)
     with artefacts.read(paths.joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
-        return DetectorSequence(metrics, slips, rig_errors(fitted, true), windows)
+        return DetectorSequence(metrics, slips, camera_errors(fitted, true), windows)
 
 
-def rig_errors(
+def camera_errors(
     fitted: Artefact | Mapping[str, Any], true: Artefact | Mapping[str, Any]
-) -> RigErrors:
+) -> CameraErrors:
     """Compare the cameras of a joint artefact with the truth, whose first camera is the master."""
     names, true_names = ([str(n) for n in a["camera_names"]] for a in (fitted, true))
     order, master = [true_names.index(name) for name in names], names.index(true_names[0])
@@ -135,7 +135,7 @@ def rig_errors(
     late = fitted["time_offset"] - true["time_offset"][order]
     bias = fitted["depth_bias"] - true["depth_bias"][order]
     bias_sigma = np.sqrt([covariance[c, 6, c, 6] for c in range(len(names))])
-    return RigErrors(
+    return CameraErrors(
         TrueAndStated(
             1e3 * moved[others],
             1e3 * stated_displacement(fitted["master_from_colour"], covariance)[others],
@@ -201,8 +201,8 @@ def figures(recordings: Sequence[DetectorSequence]) -> Figures:
     slips = [slip for recording in recordings for slip in recording.slip_m]
     if slips:
         result["grip_slip_mm"] = 1e3 * float(np.mean(slips))
-    for name in (f.name for f in fields(RigErrors)):
-        every = [getattr(recording.rig, name) for recording in recordings]
+    for name in (f.name for f in fields(CameraErrors)):
+        every = [getattr(recording.cameras, name) for recording in recordings]
         pooled = TrueAndStated(*(np.concatenate(values) for values in zip(*every, strict=True)))
         quantity, _, unit = name.rpartition("_")
         result[f"{quantity}_true_{unit}"], result[f"{quantity}_stated_{unit}"] = pooled.rms()

@@ -149,7 +149,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
     found |= keyed("verdict.", figures.bad_frame_figures([m for m in every if m.has_truth]))
     for dataset, name in ((NO_DEPTH, "no_depth"), (BUILDS, "builds"), (SHOES, "shoes")):
         some = [e for found in evaluations if found.dataset == dataset for e in found.errors]
-        found |= keyed(f"field.{name}_", _of_bodies(some)) if some else {}
+        found |= keyed(f"field.{name}_", _body_figures(some)) if some else {}
     if "field.builds_pve_mm" in found and "field.no_depth_pve_mm" in found:
         found["field.builds_ratio"] = found["field.builds_pve_mm"] / found["field.no_depth_pve_mm"]
     on_beam = [e.metrics for some in evaluations if some.dataset == BEAM for e in some.errors]
@@ -161,7 +161,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
                 unit = "mm_s" if key == "planted_speed" else "mm"
                 name = key.removeprefix("body_").removesuffix("_speed")
                 found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
-    found |= _of_up([e.up for some in evaluations for e in some.errors if e.up is not None])
+    found |= _up_figures([e.up for some in evaluations for e in some.errors if e.up is not None])
     several = [found for found in evaluations if found.dataset == PASSER_BY]
     if several:
         shares = [e.subject_right for some in several for e in some.errors]
@@ -171,13 +171,13 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
             found["field.passer_by_pve_mm"] = figures.truth_figures(every, "joint")["body_pve_mm"]
     alone = [found for found in evaluations if found.dataset == ALONE]
     if alone:
-        whole = [_of_a_person_alone(e) for some in alone for e in some.errors]
+        whole = [_is_person_alone(e) for some in alone for e in some.errors]
         count = len(whole) + sum(len(some.missing) for some in alone)
         found["field.people_alone_share"] = sum(whole) / count
     return found
 
 
-def _of_up(errors: Sequence[UpError]) -> Figures:
+def _up_figures(errors: Sequence[UpError]) -> Figures:
     """Mean error of the up direction, its stated deviation, and the largest ratio of the two."""
     if not errors:
         return {}
@@ -192,7 +192,7 @@ def _of_up(errors: Sequence[UpError]) -> Figures:
     }
 
 
-def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
+def _body_figures(some: Sequence[FieldSequence]) -> Figures:
     """Errors of skin, bone lengths and height of the recordings' bodies."""
     bones = np.abs(np.stack([e.bones for e in some])).mean(axis=1)  # by person
     return {
@@ -203,7 +203,7 @@ def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
     }
 
 
-def _of_a_person_alone(sequence: FieldSequence) -> bool:
+def _is_person_alone(sequence: FieldSequence) -> bool:
     """Whether metrics and export have a body and no object."""
     has = figures.truth_figures([sequence.metrics], "joint")
     measured = "body_pve_mm" in has and not any(name.startswith("object") for name in has)

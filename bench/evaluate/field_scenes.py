@@ -45,13 +45,13 @@ def measure(project: Project, sequence: str) -> FieldScene:
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     """Keys ``field.<measure>``; ``rates_`` for different rates; starts also by dataset."""
-    found = keyed("field.", field_errors.floor_figures(_of(evaluations, FLOOR)))
-    found |= keyed("field.", field_errors.start_figures(_of(evaluations, STARTS)))
-    found |= keyed("field.rates_", field_errors.start_figures(_of(evaluations, RATES)))
-    found |= keyed("field.", field_errors.beam_figures(_of(evaluations, BEAM)))
+    found = keyed("field.", field_errors.floor_figures(_select(evaluations, FLOOR)))
+    found |= keyed("field.", field_errors.start_figures(_select(evaluations, STARTS)))
+    found |= keyed("field.rates_", field_errors.start_figures(_select(evaluations, RATES)))
+    found |= keyed("field.", field_errors.beam_figures(_select(evaluations, BEAM)))
     windows = [e.windows for measured in evaluations for e in measured.errors if e.windows]
     found |= keyed("field.", window_figures(windows))
-    found |= keyed("field.", field_errors.fault_figures(_of(evaluations, FLOOR)))
+    found |= keyed("field.", field_errors.fault_figures(_select(evaluations, FLOOR)))
     for measured in evaluations:
         if measured.dataset.startswith(STARTS):
             rate = measured.dataset.removeprefix(STARTS)
@@ -60,8 +60,9 @@ def flat(evaluations: Sequence[FieldScenes]) -> Figures:
     return found
 
 
-def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
-    return [e for found in evaluations if found.dataset.startswith(cause) for e in found.errors]
+def _select(evaluations: Sequence[FieldScenes], prefix: str) -> list[FieldScene]:
+    """Recordings of the datasets whose names start with ``prefix``."""
+    return [e for found in evaluations if found.dataset.startswith(prefix) for e in found.errors]
 
 
 PART = EvaluationPart(

@@ -131,7 +131,7 @@ def _chain_errors(project: Project, sequence: str, rig: Rig) -> ChainErrors:
 Rigs = Measured[list[RigErrors]]
 
 
-def _all(recordings: Sequence[list[RigErrors]]) -> Figures:
+def _pooled_figures(recordings: Sequence[list[RigErrors]]) -> Figures:
     return figures([rig for recording in recordings for rig in recording])
 
 
@@ -139,7 +139,7 @@ def flat(evaluations: Sequence[Rigs]) -> Figures:
     """Keys ``rig.<measure>``."""
     found: Figures = {}
     for measured in evaluations:
-        found |= keyed(f"{measured.dataset}.", with_spread(_all, measured.errors))
+        found |= keyed(f"{measured.dataset}.", with_spread(_pooled_figures, measured.errors))
     return found
 
 

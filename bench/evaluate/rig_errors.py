@@ -8,15 +8,15 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from bench.evaluate.scan_errors import align_points
 from intercap_core import artefacts
 from intercap_core.evaluation.body import vertex_error
 from intercap_core.evaluation.object_pose import posed_point
 from intercap_core.evaluation.scene_errors import CUBE_SIDE_M, displacement, rig_centre
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
-from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import JOINT, SCENE, TRUTH
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -71,17 +71,13 @@ def _joint_errors(paths: SequencePaths, truth: Path, models: SequenceModels) -> 
 def truth_from_rig(poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
     """Rigid transform (4, 4) that best aligns a rig (C, 4, 4) with the true one.
 
-    It minimises the displacement of a 2 m cube at the rig's true centre as all cameras see it
-    (Kabsch 1976 for the points of all cameras).
+    It minimises the displacement of a 2 m cube at the rig's true centre as all cameras see it.
     """
     # eight points whose covariance is that of the cube
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) * CUBE_SIDE_M / np.sqrt(12)
     cube = rig_centre(true_poses) + corners
     points = np.concatenate([apply(pose, cube) for pose in poses @ invert(true_poses)])
-    goals = np.tile(cube, (len(poses), 1))
-    middle, goal = points.mean(0), goals.mean(0)
-    rotation = Rotation.align_vectors(goals - goal, points - middle)[0].as_matrix()
-    return rigid(rotation, goal - rotation @ middle)
+    return align_points(points, np.tile(cube, (len(poses), 1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,15 +162,15 @@ class _Pair:
             if to_plane and number >= 3:
                 step = _plane_step(points, goals, normals)
             else:
-                step = _point_step(points, goals)
+                step = align_points(points, goals)
             pose = step @ pose
             if np.abs(step - np.eye(4)).max() < 1e-7:
                 break
         return pose
 
 
-def _point_step(points: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Rigid transform (4, 4) of least squared distance from points (N, 3) to goals (Kabsch)."""
+def align_points(points: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Rigid transform (4, 4) of least squared distance from points to goals (N, 3); Kabsch 1976."""
     middle, goal = points.mean(0), goals.mean(0)
     rotation = Rotation.align_vectors(goals - goal, points - middle)[0].as_matrix()
     return rigid(rotation, goal - rotation @ middle)

@@ -26,7 +26,6 @@ from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
-PLAIN, ANNOTATED = "no annotations", "annotated"
 # Figures of the sequential fits that are repeated in the area ``joint``, and their names there
 SEQUENTIAL = {
     "body_pve_mm": "body_pve_sequential_mm",
@@ -73,16 +72,6 @@ def measure(project: Project, sequence: str) -> MeasuredSequence:
         count_behind_wall(paths, models),
         displacements(paths, models, truth_of(project, sequence)),
     )
-
-
-def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
-    """Sequences with and without annotations; empty groups are omitted."""
-    every = [e for found in evaluations for e in found.errors]
-    apart = {
-        name: [e.metrics for e in every if e.annotated == annotated]
-        for name, annotated in ((PLAIN, False), (ANNOTATED, True))
-    }
-    return {name: sequences for name, sequences in apart.items() if sequences}
 
 
 def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
@@ -153,15 +142,18 @@ def flat_areas(sequences: Sequence[SequenceMetrics]) -> Figures:
 def flat(evaluations: Sequence[Sequences]) -> Figures:
     """Keys ``joint.body_pve_mm``; areas of annotated sequences end in ``_annotated``."""
     found: Figures = {}
-    for group, sequences in groups(evaluations).items():
-        suffix = "" if group == PLAIN else "_annotated"
+    every = [e for measured in evaluations for e in measured.errors]
+    for suffix in ("", "_annotated"):
+        sequences = [e.metrics for e in every if e.annotated == bool(suffix)]
+        if not sequences:
+            continue
         for key, value in with_spread(flat_areas, sequences).items():
             area, _, name = key.partition(".")
             found[f"{area}{suffix}.{name}"] = value
-    touched, behind = sum((e.behind_wall for m in evaluations for e in m.errors), np.zeros(2))
+    touched, behind = sum((e.behind_wall for e in every), np.zeros(2))
     if touched:
         found["contact.through_wall_share"] = float(behind / touched)
-    moved = [e.displacement for m in evaluations for e in m.errors if not e.annotated]
+    moved = [e.displacement for e in every if not e.annotated]
     for stage in ("truth", "joint", "sequential"):
         values = np.concatenate([np.zeros(0), *(some[stage] for some in moved if some)])
         if len(values):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.evaluate.detector import grip_slips, rig_errors
+from bench.evaluate.detector import camera_errors, grip_slips
 
 
 def test_a_grip_slips_by_what_its_error_changes() -> None:
@@ -44,7 +44,7 @@ def test_cameras_are_compared_by_name_and_relative_to_the_master() -> None:
         "time_offset": np.array([0.006, 0.002]), "time_offset_sigma": np.array([0.001, 0.0]),
         "depth_bias": np.array([np.nan, 0.003]), "camera_covariance": covariance,
     }  # fmt: skip
-    rig = rig_errors(fitted, true)
-    assert rig.pose_mm.rms() == pytest.approx((4.0, 2.0 * np.sqrt(3)))
-    assert rig.offset_ms.rms() == pytest.approx((3.0, 1.0))
-    assert rig.depth_bias_mm.rms() == pytest.approx((2.0, 3.0))
+    found = camera_errors(fitted, true)
+    assert found.pose_mm.rms() == pytest.approx((4.0, 2.0 * np.sqrt(3)))
+    assert found.offset_ms.rms() == pytest.approx((3.0, 1.0))
+    assert found.depth_bias_mm.rms() == pytest.approx((2.0, 3.0))
