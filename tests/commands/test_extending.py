@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.extending import apply_chapter
+from tests.helpers.flow import share_kernels
+from tests.helpers.shared_folder import session_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 CHAPTERS = {"A new keypoint layout": 1, "A new converter": 1, "A new export format": 2}
@@ -24,11 +26,16 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
     folder = tmp_path_factory.mktemp("package")
     shutil.copytree(ROOT / "intercap_core", folder / "intercap_core")  # with compiled modules
     files = {title: apply_chapter(title, folder) for title in CHAPTERS}
+    share_kernels(folder / "intercap_core", folder / "kernels")
+    session = session_folder(tmp_path_factory)  # has the captures that the examples export
     tests = [path for of in files.values() for path in of if path.name.startswith("test_")]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider",
+         f"--basetemp={session / 'extending'}",
          *(word for name in FIXTURES for word in ("-p", name)), *map(str, tests)],
-        cwd=folder, env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}",
+             "NUMBA_CACHE_DIR": str(folder / "kernels"), "PYTEST_XDIST_WORKER": "extending"},
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

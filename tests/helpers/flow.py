@@ -8,6 +8,8 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,12 +63,16 @@ def share_kernels(package: Path, cache: Path) -> None:
     """Let a copy of the package at ``package`` use the project's compiled kernels in ``cache``.
 
     Numba identifies sources by path, so each folder of the copy gets a link to the project's
-    kernels of that folder. An edited copy has its own cache.
+    kernels of that folder. The copy may have been edited, except for what a kernel computes.
     """
     own = use_kernel_cache()
     assert own is not None
-    shared = cache / own.name
-    shared.mkdir(parents=True)
+    found = subprocess.run(
+        [sys.executable, "-c", f"import {package.name}, os; print(os.environ['NUMBA_CACHE_DIR'])"],
+        cwd=package.parent, env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    shared = Path(found.stdout.strip())
     for module in (ROOT / "intercap_core").rglob("*.py"):
         copied = package / module.relative_to(ROOT / "intercap_core")
         link = shared / _CacheLocator.get_suitable_cache_subpath(str(copied))
@@ -233,3 +239,21 @@ def _server(flow: Flow) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         text=True,
     )
+
+
+@contextmanager
+def edited(path: Path, text: str | None) -> Iterator[None]:
+    """Write ``text``, or delete the file, within the block; afterwards restore the file."""
+    aside = path.with_name("aside")
+    existed = path.exists()
+    if existed:
+        path.rename(aside)
+    path.parent.mkdir(exist_ok=True)
+    if text is not None:
+        path.write_text(text)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        if existed:
+            aside.rename(path)

@@ -18,8 +18,7 @@ def shared_folder(
     Args:
         make: fills the folder that it is given.
     """
-    base = factory.getbasetemp()
-    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    root = session_folder(factory) / "shared"
     folder, done = root / key, root / f"{key}.done"
     root.mkdir(exist_ok=True)
     with open(root / f"{key}.lock", "w") as lock:
@@ -29,3 +28,9 @@ def shared_folder(
             make(folder)
             done.touch()
     return folder
+
+
+def session_folder(factory: pytest.TempPathFactory) -> Path:
+    """Return the folder for temporary files that the workers of this session share."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
