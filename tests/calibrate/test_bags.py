@@ -37,7 +37,7 @@ def write_bags(project: PlainProject, form: Form, *, lenses: bool) -> None:
             path.rename(images)
 
 
-@pytest.mark.parametrize(("form", "lenses"), [("mcap", True), ("bag", True), ("mcap", False)])
+@pytest.mark.parametrize(("form", "lenses"), [("bag", True), ("mcap", False)])
 def test_poses_follow_from_a_walk_in_bags(tmp_path: Path, form: Form, lenses: bool) -> None:
     project = write_walk(tmp_path, TRUTH, UP).write(layout="ros")
     write_bags(project, form, lenses=lenses)

@@ -50,25 +50,33 @@ def test_fault_is_one_write_that_begins_a_line(
 
 
 @pytest.mark.parametrize(
-    ("stages", "libraries"),
+    "steps",
     [
-        (("frames",), {"scipy", "numba", "torch", "trimesh", "open3d.cpu.pybind"}),
-        (("detections",), {"scipy.spatial", "torch", "trimesh", "open3d.cpu.pybind"}),
-        (("scene", "person"), {"torch", "trimesh", "open3d.cpu.pybind"}),
-        (("object_track",), {"torch"}),
-        (("body_fit",), {"trimesh", "open3d.cpu.pybind"}),
-        (("joint", "metrics"), {"pandas", "scipy.stats", "matplotlib"}),
+        [
+            (("frames",), {"scipy", "numba", "torch", "trimesh", "open3d.cpu.pybind"}),
+            (("detections",), {"scipy.spatial", "torch", "trimesh", "open3d.cpu.pybind"}),
+            (("scene", "person"), {"torch", "trimesh", "open3d.cpu.pybind"}),
+            (("object_track",), {"torch"}),
+        ],
+        [
+            (("body_fit",), {"trimesh", "open3d.cpu.pybind"}),
+            (("joint", "metrics"), {"pandas", "scipy.stats", "matplotlib"}),
+        ],
     ],
+    ids=["before the fits", "fits"],
 )
-def test_stages_import_no_library_that_they_do_not_use(tmp_path, stages, libraries):
+def test_stages_import_no_library_that_they_do_not_use(
+    tmp_path: Path, steps: list[tuple[tuple[str, ...], set[str]]]
+) -> None:
     words = f"""
 import importlib, sys
 from intercap_core.pipeline.job import job
 with job("start", {str(tmp_path / "log")!r}):
     import intercap_core.pipeline.step
-    for stage in {stages!r}:
-        importlib.import_module(f"intercap_core.stages.{{stage}}")
-print(*{libraries!r} & {{*sys.modules}})
+    for stages, libraries in {steps!r}:
+        for stage in stages:
+            importlib.import_module(f"intercap_core.stages.{{stage}}")
+        print(*libraries & {{*sys.modules}})
 """
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
     assert not done.stdout.split()

@@ -96,7 +96,7 @@ def test_changed_bytes_of_an_artefact_are_found_or_harmless(tmp_path: Path) -> N
     whole = path.read_bytes()
     found = {"refused": 0, "same": 0}
     rng = np.random.default_rng(0)
-    for place in range(0, len(whole), 5):
+    for place in range(0, len(whole), 17):
         flipped = bytearray(whole)
         flipped[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
@@ -110,7 +110,7 @@ def test_changed_bytes_of_an_artefact_are_found_or_harmless(tmp_path: Path) -> N
         assert content == ("male", [0, 1, 2]) and units == "1", place
         assert read_manifest(path) in (None, long), place
         found["same"] += 1
-    assert found["refused"] > 200
+    assert found["refused"] > 60
 
 
 def test_a_damaged_record_is_none(tmp_path: Path) -> None:
