@@ -117,7 +117,8 @@ class CompiledTerms:
         self, terms: list[CompiledTerm], bodies: Bodies, at: slice, *, derivatives: bool
     ) -> Batch:
         """Pose the skeletons of the bodies ``at``, and move their points by the blend shapes."""
-        vectors, frames = bodies.vectors.numpy()[at], bodies.frames.numpy()[at]
+        vectors = bodies.vectors.numpy()[at]
+        frames = np.ascontiguousarray(bodies.frames.numpy()[at])  # kernels compile for each layout
         feature = None
         for term in terms:
             if term.rest is not None and term.rest.correctives is not None:

@@ -164,12 +164,11 @@ def test_sound_input_is_not_flagged_and_hand_touches(sound):
     np.testing.assert_array_equal(likeliest, CONTACT_REGIONS.index("right_hand"))
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_very_short_recordings(captures, tmp_path, frames: int):
+def test_a_recording_of_one_frame(captures, tmp_path):
     """Accelerations need three frames and speeds two."""
-    ball = HeldBall.copied(captures(frames), tmp_path)
+    ball = HeldBall.copied(captures(1), tmp_path)
     result = ball.run()
-    assert not result["flagged"].any() and len(result["joints"]) == frames
+    assert not result["flagged"].any() and len(result["joints"]) == 1
     assert np.linalg.norm(result["joints"] - ball.joints, axis=2).mean() < 0.005
     assert result["energy_after"].sum() <= result["energy_before"].sum()
 

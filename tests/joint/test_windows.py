@@ -26,14 +26,11 @@ def test_windows_keep_each_frame_once(count: int):
     assert len(windows) == -(-count // 400)
 
 
-@pytest.mark.parametrize("annotated", [False, True])
-def test_windows_join_to_the_fit_of_the_recording(
-    tmp_path, tmp_path_factory, monkeypatch, annotated
-):
+def test_windows_join_to_the_fit_of_the_recording(tmp_path, tmp_path_factory, monkeypatch):
     """Both windows see all frames, so that each result is that of the recording."""
     ball = HeldBall.copied(shared_capture(tmp_path_factory, FRAMES), tmp_path)
     held = [ContactInterval(part="right_hand", start=1, end=FRAMES - 1)]
-    fitted = partial(ball.run, held if annotated else None, look_again=True)
+    fitted = partial(ball.run, held, look_again=True)
     whole = fitted()
     halves = partial(split_frames, size=FRAMES // 2, overlap=FRAMES)
     monkeypatch.setattr(fit, "split_frames", halves)

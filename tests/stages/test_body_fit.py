@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,13 +20,14 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.kinematics import rotation_from_axis_angle, vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit import evidence, schedule, uncertainty
+from intercap_core.body_fit import evidence, uncertainty
 from intercap_core.body_fit.clouds import person_clouds
 from intercap_core.body_fit.observations import read_observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.surface import COVERINGS, choose_samples
 from intercap_core.body_fit.term_inputs import keypoint_set
+from intercap_core.body_fit.uncertainty import fit_covariances
 from intercap_core.config import BodyFitSettings, BodyModels
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
@@ -229,23 +231,32 @@ def test_the_same_input_gives_the_same_bytes(clothed) -> None:
     assert (folder / "again.h5").read_bytes() == (folder / "body_fit.h5").read_bytes()
 
 
-def test_a_recording_of_two_blocks_is_fitted_as_one_of_a_single_block(
-    model, tmp_path, monkeypatch
-) -> None:
-    """Both are solved to convergence: rounding would let frames stop after different steps."""
+def test_blocks_change_neither_observations_nor_covariances(model, clothed, monkeypatch) -> None:
+    """`tests/geometry/solve/test_levenberg_marquardt.py` has the same of the solver."""
+    inputs = clothed[0].inputs
+    seen = read_observations(inputs.scene, inputs.person)
+    clouds = list(person_clouds(inputs.frames, inputs.person, seen, 800))
+    fitter = Fitter(model, seen, clouds, SETTINGS)
+    found = fitter.run()
 
-    def solve(*args, **options):
-        return levenberg_marquardt.minimise(*args, **(options | {"cost_tolerance": 1e-7}))
+    def observed() -> dict[str, torch.Tensor]:
+        problem = fitter.resume(found.vectors, deepcopy(found.settled))
+        fitter.observe(problem)
+        pixels = fitter.evidence.pixel_residuals(problem)
+        fitter.evidence.refine_cloud_noise(problem)
+        return problem.rows._asdict() | {
+            "pixels": pixels, "cloud noise": fitter.evidence.cloud_noise.clone(),
+            "covariances": fit_covariances(model, found).joints,
+        }  # fmt: skip
 
-    monkeypatch.setattr(schedule, "minimise", solve)
-    capture = Capture(model, tmp_path, 24, cameras=3, clothing=0.01)
-    whole = capture.fit(tmp_path / "whole.h5")
+    whole = observed()
+    monkeypatch.setattr(uncertainty, "CHUNK_FRAMES", 1)
     for module in (levenberg_marquardt, evidence, uncertainty):
-        monkeypatch.setattr(module, "BLOCK_FRAMES", 16)
-    blocks = capture.fit(tmp_path / "blocks.h5")
-    np.testing.assert_allclose(blocks["joints"], whole["joints"], rtol=0, atol=1e-4)  # 0.1 mm
-    np.testing.assert_allclose(blocks["joint_sigma"], whole["joint_sigma"], rtol=1e-2)
-    assert np.array_equal(blocks["undetermined"], whole["undetermined"])
+        monkeypatch.setattr(module, "BLOCK_FRAMES", 2)
+    for name, values in observed().items():
+        expected = whole[name].numpy()
+        atol = 1e-5 * np.nanmax(np.abs(expected))  # single precision
+        np.testing.assert_allclose(values.numpy(), expected, rtol=1e-4, atol=atol, err_msg=name)
 
 
 def test_unseen_and_contradicted_parts_are_undetermined(model, clothed, tmp_path) -> None:

@@ -147,14 +147,14 @@ def test_a_window_of_the_inputs_has_the_data_of_its_frames(capture: fitted.Captu
 
 
 def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: HeldOut) -> None:
-    """Against Gauss-Newton steps with correspondences taken anew, until they end."""
+    """Against Gauss-Newton steps with correspondences taken anew."""
     with _opened(capture) as (inputs, settings, result):
         assembly = assemble(inputs, settings)
         assembly.contact.take_contact(result.probability, result.annotated)
 
         def descended(used: np.ndarray) -> State:
             state = result.state
-            for _ in range(6):
+            for _ in range(3):
                 assembly.problem.refresh(state)
                 equations = BandedEquations(len(state))
                 for term in assembly.problem.terms:
