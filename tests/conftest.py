@@ -92,7 +92,7 @@ FULL = (
 # One test of each that `make test` runs as well.
 SMOKE = frozenset(
     {
-        "test_a_step_is_drawn_in_all_views_in_time",
+        "test_requests_are_repeated_after_a_lost_connection",
         "test_pages_print_no_errors_and_ask_for_nothing",
         "test_loads_plays_and_seeks_without_an_error",
         "test_a_user_error_is_submitted_once",

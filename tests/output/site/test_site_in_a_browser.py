@@ -29,7 +29,7 @@ def pages(site: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pat
     }
 
 
-def test_pages_print_no_errors_and_ask_for_nothing(pages: dict[str, Path], tmp_path: Path) -> None:
+def test_requests_and_errors_are_recorded(tmp_path: Path) -> None:
     bad = tmp_path / "bad.html"
     bad.write_text('<img src="http://127.0.0.1:9/x.png"><script>console.error("wrong")</script>')
     with visit(bad, log=tmp_path / "bad.json") as visited:
@@ -37,15 +37,21 @@ def test_pages_print_no_errors_and_ask_for_nothing(pages: dict[str, Path], tmp_p
     assert "wrong" in visited.console
     assert asked(tmp_path / "bad.json") == {"http://127.0.0.1:9/x.png"}
 
-    for name, page in pages.items():
-        log = tmp_path / f"{name}.json"
-        with visit(page, log=log) as visited:
-            if name != "overview":
-                visited.wait()
-            image = visited.picture()
-        assert visited.console == []
-        assert not [address for address in asked(log) if not address.startswith("blob:")]
-        assert image.shape[:2] == (2400, 1240) and image.std() > 10
+
+@pytest.mark.parametrize(
+    "name", ["overview", "sequence", pytest.param("viewer", marks=pytest.mark.full)]
+)
+def test_pages_print_no_errors_and_ask_for_nothing(
+    pages: dict[str, Path], tmp_path: Path, name: str
+) -> None:
+    log = tmp_path / "log.json"
+    with visit(pages[name], log=log) as visited:
+        if name != "overview":
+            visited.wait()
+        image = visited.picture()
+    assert visited.console == []
+    assert not [address for address in asked(log) if not address.startswith("blob:")]
+    assert image.shape[:2] == (2400, 1240) and image.std() > 10
 
 
 @pytest.mark.parametrize(
