@@ -17,7 +17,7 @@ from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.project import load_project
 from intercap_core.sequence_inputs import FitSettings, SequenceModels
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
-from tests.helpers.flow import ONE, OTHER, Flow
+from tests.helpers.flow import ONE, OTHER, Flow, edited
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = "\n".join(path.read_text() for path in sorted((ROOT / "workflow/rules").glob("*.smk")))
@@ -83,16 +83,17 @@ def test_snakemake_finds_no_fault_and_understands_the_profile(
 
 
 @pytest.mark.parametrize("profile", [(), ("--workflow-profile", "slurm")])
-def test_the_scene_of_another_sequence_is_made_first(
-    tmp_path: Path, profile: tuple[str, ...]
-) -> None:
-    """A fresh project; only the sequence that reuses the other one's cameras is requested."""
-    flow = Flow.copy(tmp_path)
-    table = tmp_path / "config" / "test" / "sequences.tsv"
+def test_the_scene_of_another_sequence_is_made_first(flow: Flow, profile: tuple[str, ...]) -> None:
+    """Only the sequence that reuses the other one's cameras is requested."""
+    table = flow.folder / "config" / "test" / "sequences.tsv"
     header, *rows = table.read_text().splitlines()
     cells = [f"{row}\t{ONE if row.startswith(OTHER) else ''}" for row in rows]
-    table.write_text("\n".join([f"{header}\trig_from", *cells, ""]))
-    done = flow.run("--dry-run", *profile, f"results/test/{OTHER}/scene.h5")
+    scene = flow.artefact(ONE, "scene")
+    with (
+        edited(table, "\n".join([f"{header}\trig_from", *cells, ""])),
+        edited(scene, None),
+    ):
+        done = flow.ask("--dry-run", *profile, f"results/test/{OTHER}/scene.h5")
     assert done.returncode == 0, done.stderr
     reasons = re.findall(r"^Job \d+: (\w+): .*\nReason: (.*)$", done.stdout, re.MULTILINE)
     made = f"results/test/{ONE}/scene.h5"
