@@ -80,7 +80,6 @@ SLOW = (
 # Folders and files of the second tier, `make test-all`.
 FULL = (
     "annotate/browser",
-    "bench/evaluate/test_scan_errors.py",  # tests/scan/test_walk.py measures a scan by it
     "joint/test_extending.py",
     "output/site/test_site_in_a_browser.py",
     "output/viewer/test_browser.py",
@@ -93,7 +92,6 @@ FULL = (
 # One test of each that `make test` runs as well.
 SMOKE = frozenset(
     {
-        "test_figures_are_means_over_objects_and_a_geometric_mean_of_ratios",
         "test_requests_are_repeated_after_a_lost_connection",
         "test_pages_print_no_errors_and_ask_for_nothing",
         "test_loads_plays_and_seeks_without_an_error",

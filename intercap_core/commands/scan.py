@@ -25,9 +25,9 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.output.site.scan_page import scan_page
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
-from intercap_core.scan.alignment import track_from
 from intercap_core.scan.fusion import Posed, fuse
 from intercap_core.scan.handled import Chain, cloud_of, find_handled, is_still, slowest
+from intercap_core.scan.multiview import register_turned
 from intercap_core.scan.result import ScannedMesh, finish, simplified
 from intercap_core.scan.standing import ON_PLANE_M, find_standing, posed
 from intercap_core.scan.surfaces import Recording
@@ -40,6 +40,9 @@ READ = ("frames", "detections", "scene", "person")
 ROUNDS = 2  # of tracking and fusion; the second one tracks with a mesh of all frame sets
 TRACKED_VOXELS, TRACKED_FACES = 100**3, 1500  # of the grid and of the mesh that is tracked
 MIN_TRACKED = 10  # frame sets with a pose
+# Largest standard deviation of a registered pose that the tracker takes as known: depth is averaged
+# over 1 cm, and poses of the tracker are off by 3 mm
+SURE_M = 0.004
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
 MIN_EXPLAINED = 0.9  # least share of the object's points on the mesh
 NOTED_CLOSED = 0.03  # share of the surface from which on the page should be looked at
@@ -220,17 +223,19 @@ def _scan(
     clouds = {t: cloud_of(views) for t, views in shown[0].items()}
     seed = max(slowest(shown[0]), key=lambda t: len(clouds[t].points))
     extent = float(np.ptp(clouds[seed].points, axis=0).max())
-    poses: Mapping[int, np.ndarray] = track_from(clouds, seed, max(0.004, extent / 100))
+    registered = register_turned(clouds, seed, max(0.004, extent / 100))
+    poses: Mapping[int, np.ndarray] = {t: found.pose for t, found in registered.items()}
     up = recordings[0].zup_from_master[2, :3]  # the object's frame has the master's axes
     if len(shown) == 1 and is_still(shown[0]):
         parts = [Posed(recordings[0], shown[0], dict.fromkeys(shown[0], poses[seed]))]
         return finish(fuse(parts, up=up), parts, up)
     surface = fuse([Posed(recordings[0], shown[0], poses)], up=up, voxels=TRACKED_VOXELS)
+    sure = [_pose_of(t, r.pose) for t, r in sorted(registered.items()) if r.sigma_m < SURE_M]
     for round_ in range(ROUNDS):
         entry = _tracked_entry(surface, name, labels, places)
         parts = []
         for recording, views in zip(recordings, shown, strict=True):
-            known = [_pose_of(seed, poses[seed])] if recording is recordings[0] else []
+            known = sure if recording is recordings[0] else []
             track = _track(project, recording, entry, known, places)
             parts.append(Posed(recording, views, _poses(track)))
             _require_poses(parts[-1], name)

@@ -3,6 +3,7 @@
 - ``surfaces``: depth pixels that show the object, in each frame set.
 - ``handled``: the object that moves, among the parts that the candidates show.
 - ``alignment``: poses of the frame sets around the first one, by registration of points.
+- ``multiview``: poses that align all of these together, without drift.
 - ``volume``: signed distance field of depth images, and its closed surface.
 - ``fusion``: the field and the colours of recordings with known poses.
 - ``walk``: poses of one camera that is carried through a scene at rest.

@@ -24,7 +24,8 @@ FACING = 0.5  # least cosine between corresponding normals: the two sides of a p
 # they determine turns about an axis of symmetry.
 PRIOR = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 MAX_POINTS = 3000  # of a frame set in its registration
-GOOD_SHARE = 0.85  # least share of points that correspond, of a registered frame set
+GOOD_SHARE = 0.85  # least share of points near the model, of a registered frame set
+SHARED_ERROR = 30.0  # neighbouring points that share one error of depth or of the rig's poses
 STEPS = 30
 
 
@@ -65,6 +66,19 @@ class Cloud:
         return Cloud(points[kept], normals[kept] / length[kept, None])
 
 
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A registered cloud."""
+
+    pose: np.ndarray
+    """(4, 4) master_from_object."""
+    share: float
+    """Share of the points within three times :data:`NOISE_M` of the model. Normals do not count,
+    because those of rods are noise."""
+    sigma_m: float
+    """Standard deviation of the cloud's points by that of the pose (RMS), metres."""
+
+
 class Model:
     """Nearest neighbours in the cloud of an object, in its frame."""
 
@@ -78,11 +92,8 @@ class Model:
         start: np.ndarray,
         reach_m: float = REACH_M,
         finest_m: float = 3 * NOISE_M,
-    ) -> tuple[np.ndarray, float]:
-        """Pose of the object that aligns a cloud in the master frame with the model.
-
-        Returns the pose master_from_object (4, 4), and the share of the points that correspond to
-        a point of the model within three times :data:`NOISE_M`.
+    ) -> Registration:
+        """Align a cloud in the master frame with the model.
 
         Args:
             cloud: points that show the object, master frame.
@@ -94,7 +105,7 @@ class Model:
         about = apply(object_from_master, cloud.points.mean(0)[None])[0]
         precision = np.diag(PRIOR**-2)
         moved_by = np.zeros(6)
-        share = 0.0
+        share, information = 0.0, np.zeros((6, 6))
         for step in range(STEPS):
             reach = max(reach_m * 0.8**step, finest_m)
             own = cloud.moved(object_from_master)
@@ -102,7 +113,7 @@ class Model:
             near[~np.isfinite(distance)] = 0
             normals = self.cloud.normals[near]
             agree = np.isfinite(distance) & ((own.normals * normals).sum(1) > FACING)
-            share = float((agree & (distance < 3 * NOISE_M)).mean())
+            share = float((distance < 3 * NOISE_M).mean())
             if agree.sum() < 20:
                 break
             points, normals = own.points[agree], normals[agree]
@@ -110,10 +121,9 @@ class Model:
             scale = max(NOISE_M, reach / 6)
             weight = (scale / (scale**2 + residual**2)) ** 2  # Geman-McClure, over the variance
             jacobian = np.concatenate([np.cross(points - about, normals), normals], 1)
-            matrix = (jacobian * weight[:, None]).T @ jacobian + precision
-            change = -np.linalg.solve(
-                matrix, jacobian.T @ (weight * residual) + precision @ moved_by
-            )
+            information = (jacobian * weight[:, None]).T @ jacobian
+            gradient = jacobian.T @ (weight * residual) + precision @ moved_by
+            change = -np.linalg.solve(information + precision, gradient)
             moved_by = moved_by + change
             turn = rotation_exp(change[:3])
             step_about = rigid(turn, about + change[3:] - turn @ about)
@@ -122,7 +132,9 @@ class Model:
                 break
         # products of rounded rotations would leave the rotations, faster with each frame
         rotation = Rotation.from_matrix(object_from_master[:3, :3]).as_matrix()
-        return invert(rigid(rotation, object_from_master[:3, 3])), share
+        pose = invert(rigid(rotation, object_from_master[:3, 3]))
+        arms = apply(object_from_master, cloud.points) - about
+        return Registration(pose, share, _spread(arms, information / SHARED_ERROR + precision))
 
     def overlap(self, cloud: Cloud, pose: np.ndarray, reach_m: float) -> tuple[float, float]:
         """Share of the points of a cloud near the model, and share of these on its surface.
@@ -144,6 +156,14 @@ class Model:
         return float(found.mean()), float((agree & (off < 3 * NOISE_M)).mean())
 
 
+def _spread(points: np.ndarray, precision: np.ndarray) -> float:
+    """RMS standard deviation of points (N, 3) that a twist of a ``precision`` (6, 6) moves."""
+    covariance = np.linalg.inv(precision)
+    turned = np.cross(np.eye(3)[:, None], points).transpose(1, 2, 0)  # (N, 3, 3) by unit turns
+    moved_by = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], 2)
+    return float(np.sqrt(np.einsum("nij,jk,nik->n", moved_by, covariance, moved_by).mean()))
+
+
 def some(cloud: Cloud, count: int = MAX_POINTS) -> Cloud:
     """At most ``count`` points, evenly over the order of the points."""
     if len(cloud.points) <= count:
@@ -151,32 +171,30 @@ def some(cloud: Cloud, count: int = MAX_POINTS) -> Cloud:
     return cloud.subset(np.linspace(0, len(cloud.points) - 1, count).astype(int))
 
 
-def track_from(clouds: Mapping[int, Cloud], seed: int, cell_m: float) -> dict[int, np.ndarray]:
-    """Poses of the object around a frame set, as long as the registration is good.
+def track_from(clouds: Mapping[int, Cloud], seed: int, cell_m: float) -> dict[int, Registration]:
+    """Register the frame sets around one of them, as long as the registration is good.
 
-    The object's frame has the master's axes. Its origin is the mean of the points at the seed.
+    The object's frame has the master's axes. Its origin is the mean of the points at the seed. Each
+    registration starts with the motion between the two frame sets before it.
 
     Args:
         clouds: points that show the object by frame set, master frame.
         seed: frame set that defines the object's frame.
         cell_m: cell of the model, metres.
-
-    Returns:
-        Poses master_from_object (4, 4) of the registered frame sets.
     """
-    first = np.eye(4)
-    first[:3, 3] = clouds[seed].points.mean(0)
-    poses = {seed: first}
+    first = rigid(np.eye(3), clouds[seed].points.mean(0))
+    result = {seed: Registration(first, 1.0, 0.0)}
     model = Model(clouds[seed].moved(invert(first)).thinned(cell_m))
     order = sorted(clouds)
     at = order.index(seed)
     for way in (order[at + 1 :], order[:at][::-1]):
-        last = first
+        last, motion = first, np.eye(4)
         for t in way:
-            pose, share = model.register(some(clouds[t]), last)
-            if share < GOOD_SHARE:
+            found = model.register(some(clouds[t]), motion @ last)
+            if found.share < GOOD_SHARE:
                 break
-            poses[t] = last = pose
-            own = clouds[t].moved(invert(pose))
+            result[t] = found
+            last, motion = found.pose, found.pose @ invert(last)
+            own = clouds[t].moved(invert(found.pose))
             model = Model(Cloud.joined([model.cloud, own]).thinned(cell_m))
-    return poses
+    return result

@@ -12,7 +12,14 @@ from scipy.spatial import cKDTree
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.scan.handled import Chain
-from intercap_core.scan.surfaces import OBJECT, OTHER, UNKNOWN, DepthImages, ViewSurface
+from intercap_core.scan.surfaces import (
+    OBJECT,
+    OTHER,
+    UNKNOWN,
+    DepthImages,
+    ViewSurface,
+    floating,
+)
 from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
 
 MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurements mix surfaces
@@ -120,7 +127,8 @@ def _labelled(
     local = apply(depth_from_object, box)
     if local[:, 2].min() < NEAREST_M:
         return None
-    kind = np.where(depth > 0, OTHER, UNKNOWN).astype(np.uint8)
+    mixed = floating((1e3 * depth).astype(np.uint16))  # may pass beside a rod that it shows
+    kind = np.where((depth > 0) & ~mixed, OTHER, UNKNOWN).astype(np.uint8)
     weight = np.ones(depth.shape, np.float32)
     if view is not None:
         mask = np.zeros(depth.shape, np.uint8)

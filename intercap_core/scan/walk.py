@@ -1,29 +1,23 @@
 """Poses of one depth camera that is carried through a scene at rest.
 
 Each frame set is registered to the last keyframes: frame-to-model tracking as in
-:mod:`.alignment`, on all surfaces in view. The drift is removed by multiview registration (Pulli,
-3DIM 1999): the distances along the normals (Chen and Medioni 1992) between each pair of keyframes
-with a common view are minimised over the poses of all keyframes. Pairs to which the walk returns
-close the loop.
+:mod:`.alignment`, on all surfaces in view. :mod:`.multiview` removes the drift.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp
-from intercap_core.progress import Progress
-from intercap_core.scan.alignment import FACING, NOISE_M, Cloud, Model
+from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.scan.alignment import Cloud, Model
+from intercap_core.scan.multiview import align_together, are_apart, balanced
 from intercap_core.scan.surfaces import DepthImages, floating
 
 FARTHEST_M = 3.5  # points beyond are left out: their noise exceeds 7 mm (Tolgyessy et al. 2021)
@@ -40,13 +34,8 @@ LOST_S = 1.0  # longest time without registration
 KEY_DEG, KEY_M = 7.0, 0.10  # motion from one keyframe to the next
 LOCAL = 8  # keyframes in the model that is tracked
 PAIR_DEG, PAIR_M = 35.0, 0.45  # largest difference of the poses of a pair with a common view
-NEIGHBOURS = 3  # keyframes that each one is paired with before and after it
 DRIFT_M = 0.12  # reach of the first correspondences of all keyframes together
-ROUNDS = 14
 CHANGED_MM = 40.0  # change of a depth pixel that is no noise
-UNDETERMINED = 1e-3 / NOISE_M**2  # precision of a keyframe that no pair determines
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +115,7 @@ class HandHeld(DepthImages):
         if seen is None or kept.sum() < SAMPLES // 10:
             return None
         cloud = Cloud(seen[1][kept], seen[2][kept])
-        return Keyframe(t, cloud, balanced(cloud))
+        return Keyframe(t, cloud, balanced(cloud, SAMPLES))
 
 
 def _normals(grid: np.ndarray) -> np.ndarray:
@@ -165,23 +154,6 @@ def camera_moves(frames: Frames) -> bool:
     return bool(changed) and float(np.median(changed)) > 0.5
 
 
-def balanced(cloud: Cloud, count: int = SAMPLES) -> Cloud:
-    """At most ``count`` points, evenly over 24 directions of the normals.
-
-    Small surfaces of rare directions determine the pose as much as the floor (Rusinkiewicz and
-    Levoy, 3DIM 2001).
-    """
-    axis = np.abs(cloud.normals).argmax(1)
-    octant = (cloud.normals > 0) @ np.array([1, 2, 4])
-    direction = 8 * axis + octant
-    share = count // len(np.unique(direction))
-    chosen = []
-    for value in np.unique(direction):
-        index = np.flatnonzero(direction == value)
-        chosen.append(index[np.linspace(0, len(index) - 1, min(share, len(index))).astype(int)])
-    return cloud.subset(np.concatenate(chosen))
-
-
 def follow(images: HandHeld) -> Walk:
     """Poses of the keyframes of a recording.
 
@@ -195,9 +167,9 @@ def follow(images: HandHeld) -> Walk:
         share = 0.0
         if seen is not None and model is not None:
             predicted = pose @ step
-            camera_from_world, _ = model.register(
+            camera_from_world = model.register(
                 seen.sample, invert(predicted), PREDICTED_M, REACH_M
-            )
+            ).pose
             near, share = model.overlap(seen.sample, camera_from_world, NEAR_M)
         elif seen is not None:
             camera_from_world, near, share = np.eye(4), 1.0, 1.0
@@ -211,7 +183,7 @@ def follow(images: HandHeld) -> Walk:
         lost = 0
         step = invert(pose) @ invert(camera_from_world) if model is not None else np.eye(4)
         pose = invert(camera_from_world)
-        if not poses or _apart(poses[-1], pose, KEY_DEG, KEY_M):
+        if not poses or are_apart(poses[-1], pose, KEY_DEG, KEY_M):
             thinned = Keyframe(t, seen.cloud.thinned(CELL_M), seen.sample)
             keyframes.append(thinned)
             poses.append(pose)
@@ -222,7 +194,11 @@ def follow(images: HandHeld) -> Walk:
             f"sequence {images.frames.sequence}: no frame set has depth within {FARTHEST_M} m; "
             "keep the object 0.5 to 1.5 m in front of the camera"
         )
-    return Walk(images.rig[0], keyframes, aligned_together(keyframes, np.stack(poses)))
+    together = align_together(
+        [key.cloud for key in keyframes], [key.sample for key in keyframes], np.stack(poses),
+        reach_m=(DRIFT_M, REACH_M), view_deg=PAIR_DEG, view_m=PAIR_M,
+    )  # fmt: skip
+    return Walk(images.rig[0], keyframes, together)
 
 
 def _lost(images: HandHeld, t: int, share: float) -> UserError:
@@ -232,82 +208,3 @@ def _lost(images: HandHeld, t: int, share: float) -> UserError:
         f"before, expected {FOLLOWED:.0%}. Walk more slowly, keep the object and what stands "
         "around it in view, and let nothing else move"
     )
-
-
-def _apart(first: np.ndarray, second: np.ndarray, degrees: float, metres: float) -> bool:
-    """Whether two poses (4, 4) differ by more than an angle or a distance."""
-    between = invert(first) @ second
-    turned = np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1)))
-    return bool(turned > degrees or np.linalg.norm(between[:3, 3]) > metres)
-
-
-def aligned_together(keyframes: Sequence[Keyframe], poses: np.ndarray) -> np.ndarray:
-    """Poses (K, 4, 4) that align all keyframes with each other.
-
-    Gauss-Newton with Geman-McClure weights; the first pose is fixed. Correspondences are the
-    nearest points within a reach that shrinks from ``DRIFT_M`` to ``REACH_M``.
-
-    Args:
-        poses: (K, 4, 4) world_from_camera with drift.
-    """
-    count = len(keyframes)
-    pairs = [
-        (i, j)
-        for i in range(count)
-        for j in range(count)
-        if i != j and (abs(i - j) <= NEIGHBOURS or not _apart(poses[i], poses[j], PAIR_DEG, PAIR_M))
-    ]
-    trees = [cKDTree(key.cloud.points) for key in keyframes]
-    progress = Progress(log, "aligned", ROUNDS, "rounds")
-    for reach in np.geomspace(DRIFT_M, REACH_M, ROUNDS):
-        matrix, right = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
-        about = poses[:, :3, 3].mean(0)
-        for i, j in pairs:
-            source = keyframes[i].sample.moved(invert(poses[j]) @ poses[i])
-            matched = _matched(source, keyframes[j].cloud, trees[j], reach)
-            points = apply(poses[j], matched.points) - about
-            normals = matched.normals @ poses[j][:3, :3].T
-            jacobian = np.concatenate([np.cross(points, normals), normals], 1)
-            weighted = jacobian * matched.weight[:, None]
-            block, vector = weighted.T @ jacobian, weighted.T @ matched.residual
-            for one, other in ((i, j), (j, i)):  # the distance depends on the relative motion
-                matrix[one, :, one] += block
-                matrix[one, :, other] -= block
-            right[i] += vector
-            right[j] -= vector
-        free = matrix.reshape(6 * count, 6 * count)[6:, 6:]
-        free[np.diag_indices_from(free)] += UNDETERMINED
-        change = np.zeros((count, 6))
-        if count > 1:
-            change[1:] = -np.linalg.solve(free, right.ravel()[6:]).reshape(-1, 6)
-        turns = rotation_exp(change[:, :3])
-        poses = rigid(turns, about + change[:, 3:] - turns @ about) @ poses
-        progress.step()
-    return poses
-
-
-class _Matches(NamedTuple):
-    """Points that correspond to a keyframe's, in its frame. M points."""
-
-    points: np.ndarray
-    """(M, 3)."""
-    normals: np.ndarray
-    """(M, 3) of the keyframe's surface."""
-    residual: np.ndarray
-    """(M,) distance along the normal, metres."""
-    weight: np.ndarray
-    """(M,) robust weight over the variance."""
-
-
-def _matched(source: Cloud, target: Cloud, tree: cKDTree, reach: float) -> _Matches:
-    """The points of ``source`` within ``reach`` of ``target``, both in one frame."""
-    distance, near = tree.query(source.points, distance_upper_bound=reach)
-    found = np.isfinite(distance)
-    points, near = source.points[found], near[found]
-    agree = (source.normals[found] * target.normals[near]).sum(1) > FACING
-    points, near = points[agree], near[agree]
-    normals = target.normals[near]
-    residual = (normals * (points - target.points[near])).sum(1)
-    scale = max(NOISE_M, reach / 6)
-    weight = (scale / (scale**2 + residual**2)) ** 2  # Geman-McClure
-    return _Matches(points, normals, residual, weight)
