@@ -23,7 +23,7 @@ NEIGHBOURS = 3  # clouds that each one is paired with before and after it
 ROUNDS = 14
 UNDETERMINED = 1e-3 / NOISE_M**2  # precision of a cloud that no pair determines
 # Of the frame sets of a turned object
-ALIGNED_SETS, SAMPLES = 40, 1500  # frame sets, and points of each
+ALIGNED_SETS, SAMPLES = 30, 800  # frame sets, and points of each
 # From the drift of the tracking (4 cm at the ends of a racquet) to three times the noise
 OBJECT_REACH_M = (0.06, 3 * NOISE_M)
 SAME_SIDES_DEG = 35.0  # turn of an object of which cameras around it still see common sides
