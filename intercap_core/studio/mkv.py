@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -59,17 +59,19 @@ def _size(length: int, width: int = 0) -> bytes:
     return (length | 1 << 7 * width).to_bytes(width, "big")
 
 
-def _element(name: str, payload: bytes, width: int = 0) -> bytes:
+# Content of an element: bytes, a number, text, or other elements by name.
+Content = bytes | int | str | dict[str, Any]
+
+
+def _element(name: str, content: Content, width: int = 0) -> bytes:
+    """Serialize an element; its length has ``width`` bytes, 0 = the fewest."""
+    if isinstance(content, dict):
+        payload = b"".join(_element(*item) for item in content.items())
+    elif isinstance(content, int):
+        payload = content.to_bytes(max(1, (content.bit_length() + 7) // 8), "big")
+    else:
+        payload = content if isinstance(content, bytes) else content.encode()
     return _id(name) + _size(len(payload), width) + payload
-
-
-def _unsigned(name: str, value: int, width: int = 0) -> bytes:
-    width = width or max(1, (value.bit_length() + 7) // 8)
-    return _element(name, value.to_bytes(width, "big"))
-
-
-def _text(name: str, value: str) -> bytes:
-    return _element(name, value.encode())
 
 
 class MkvWriter:
@@ -122,12 +124,20 @@ class MkvWriter:
         self._cues: list[bytes] = []
         self._last_us = 0
 
-        tags = self._tags(colour_mode, depth_mode, calibration_json is not None)
+        # Value of each tag, and the track or attachment that it describes; "" = the file.
+        tags: dict[str, tuple[str, str]] = {}
+        colour = f"{colour_format}_{colour_mode}"
+        modes = {"COLOR": colour, "DEPTH": depth_mode or "", "IR": "ACTIVE", "IMU": "ON"}
+        for name in names:
+            tags[f"K4A_{name}_TRACK"] = (str(self._uid(name)), name)
+            tags[f"K4A_{name}_MODE"] = (modes[name], name)
+        if calibration_json is not None:
+            tags["K4A_CALIBRATION_FILE"] = ("calibration.json", "calibration.json")
         tags["K4A_DEPTH_DELAY_NS"] = (str(depth_delay_ns), "")
         tags["K4A_WIRED_SYNC_MODE"] = (wired_sync_mode, "")
         if wired_sync_mode == "SUBORDINATE":
             tags["K4A_SUBORDINATE_DELAY_NS"] = (str(subordinate_delay_ns), "")
-        tags["K4A_DEVICE_SERIAL_NUMBER"] = (self._serial, "")
+        tags["K4A_DEVICE_SERIAL_NUMBER"] = (serial, "")
         tags["K4A_START_OFFSET_NS"] = (str(start_offset_ns), "")
 
         self._file: IO[bytes] = open(path, "wb")  # noqa: SIM115 - closed by close()
@@ -175,7 +185,7 @@ class MkvWriter:
             self._file.write(_element("Cues", b"".join(self._cues)))
         end = self._file.tell()
         entries = b"".join(
-            _element("Seek", _element("SeekID", _id(name)) + _unsigned("SeekPosition", position, 8))
+            _element("Seek", {"SeekID": _id(name), "SeekPosition": position.to_bytes(8, "big")})
             for name, position in positions.items()
         )
         head = _element("SeekHead", entries)
@@ -190,80 +200,54 @@ class MkvWriter:
         digest = hashlib.sha256(f"{self._serial}/{name}".encode()).digest()
         return int.from_bytes(digest[:7], "big") | 1
 
-    def _tags(
-        self, colour_mode: str, depth_mode: str | None, calibrated: bool
-    ) -> dict[str, tuple[str, str]]:
-        """Tags: name -> (value, track or attachment that the tag describes; "" = the file)."""
-        tags = {
-            "K4A_COLOR_TRACK": (str(self._uid("COLOR")), "COLOR"),
-            "K4A_COLOR_MODE": (f"{self._colour_format}_{colour_mode}", "COLOR"),
-        }
-        if depth_mode:
-            tags["K4A_DEPTH_TRACK"] = (str(self._uid("DEPTH")), "DEPTH")
-            tags["K4A_DEPTH_MODE"] = (depth_mode, "DEPTH")
-        if "IR" in self._tracks:
-            tags["K4A_IR_TRACK"] = (str(self._uid("IR")), "IR")
-            tags["K4A_IR_MODE"] = ("ACTIVE", "IR")
-        if "IMU" in self._tracks:
-            tags["K4A_IMU_TRACK"] = (str(self._uid("IMU")), "IMU")
-            tags["K4A_IMU_MODE"] = ("ON", "IMU")
-        if calibrated:
-            tags["K4A_CALIBRATION_FILE"] = ("calibration.json", "calibration.json")
-        return tags
-
     def _write_head(
         self, fps: int, calibration: bytes | None, tags: dict[str, tuple[str, str]]
     ) -> None:
-        ebml = (
-            _unsigned("EBMLVersion", 1)
-            + _unsigned("EBMLReadVersion", 1)
-            + _unsigned("EBMLMaxIDLength", 4)
-            + _unsigned("EBMLMaxSizeLength", 8)
-            + _text("DocType", "matroska")
-            + _unsigned("DocTypeVersion", 2)
-            + _unsigned("DocTypeReadVersion", 2)
-        )
+        ebml: Content = {
+            "EBMLVersion": 1, "EBMLReadVersion": 1, "EBMLMaxIDLength": 4, "EBMLMaxSizeLength": 8,
+            "DocType": "matroska", "DocTypeVersion": 2, "DocTypeReadVersion": 2,
+        }  # fmt: skip
         self._file.write(_element("EBML", ebml) + _id("Segment") + _UNKNOWN_SIZE)
         self._segment_start = self._file.tell()
         self._file.write(_element("Void", bytes(_SEEK_HEAD_BYTES - 9), 8))
 
         self._positions: dict[str, int] = {}
-        info = (
-            _unsigned("TimestampScale", TIMECODE_SCALE_NS)
-            + _text("MuxingApp", "intercap")
-            + _text("WritingApp", "intercap")
-            + _text("Title", "Azure Kinect")
-            + _element("Duration", bytes(8))  # filled in at the end
-        )
+        info = {
+            "TimestampScale": TIMECODE_SCALE_NS,
+            "MuxingApp": "intercap",
+            "WritingApp": "intercap",
+            "Title": "Azure Kinect",
+            "Duration": bytes(8),  # filled in at the end
+        }
         self._top("Info", info)
         self._duration_at = self._file.tell() - 8
         self._top("Tracks", b"".join(self._track_entry(n, i, fps) for n, i in self._tracks.items()))
         if calibration is not None:
-            attached = (
-                _text("FileName", "calibration.json")
-                + _text("FileMimeType", "application/octet-stream")
-                + _element("FileData", calibration)
-                + _unsigned("FileUID", self._uid("calibration.json"))
-            )
-            self._top("Attachments", _element("AttachedFile", attached))
+            attached = {
+                "FileName": "calibration.json",
+                "FileMimeType": "application/octet-stream",
+                "FileData": calibration,
+                "FileUID": self._uid("calibration.json"),
+            }
+            self._top("Attachments", {"AttachedFile": attached})
         self._top("Tags", b"".join(self._tag(name, *value) for name, value in tags.items()))
 
-    def _top(self, name: str, payload: bytes) -> None:
+    def _top(self, name: str, payload: Content) -> None:
         """Write an element of the Segment and remember its position for the index."""
         self._positions[name] = self._file.tell() - self._segment_start
         self._file.write(_element(name, payload))
 
     def _track_entry(self, name: str, number: int, fps: int) -> bytes:
         """The TrackEntry of a track."""
-        entry = (
-            _unsigned("TrackNumber", number)
-            + _unsigned("TrackUID", self._uid(name))
-            + _unsigned("TrackType", _SUBTITLE if name == "IMU" else _VIDEO)
-            + _unsigned("FlagLacing", 0)
-            + _text("Name", name)
-        )
+        entry: dict[str, Any] = {
+            "TrackNumber": number,
+            "TrackUID": self._uid(name),
+            "TrackType": _SUBTITLE if name == "IMU" else _VIDEO,
+            "FlagLacing": 0,
+            "Name": name,
+        }
         if name == "IMU":
-            return _element("TrackEntry", entry + _text("CodecID", "S_K4A/IMU"))
+            return _element("TrackEntry", {**entry, "CodecID": "S_K4A/IMU"})
         if name == "COLOR":
             (width, height), bits = self._colour_size, _COLOUR_BITS[self._colour_format]
             four_cc = self._colour_format.encode()
@@ -275,24 +259,23 @@ class MkvWriter:
         header = struct.pack(
             "<IiiHH4sIiiII", 40, width, height, 1, bits, four_cc, image_bytes, 0, 0, 0, 0
         )
-        entry += (
-            _text("CodecID", "V_MS/VFW/FOURCC")
-            + _element("CodecPrivate", header)
-            + _unsigned("DefaultDuration", 1_000_000_000 // fps)
-            + _element("Video", _unsigned("PixelWidth", width) + _unsigned("PixelHeight", height))
-        )
+        entry |= {
+            "CodecID": "V_MS/VFW/FOURCC",
+            "CodecPrivate": header,
+            "DefaultDuration": 1_000_000_000 // fps,
+            "Video": {"PixelWidth": width, "PixelHeight": height},
+        }
         return _element("TrackEntry", entry)
 
     def _tag(self, name: str, value: str, about: str) -> bytes:
         """The element of a tag, for the whole file if ``about`` is ""."""
-        target = b""
+        target: Content = {}
         if about in self._tracks:
-            target = _text("TargetType", "TRACK") + _unsigned("TagTrackUID", self._uid(about))
+            target = {"TargetType": "TRACK", "TagTrackUID": self._uid(about)}
         elif about:
-            uid = _unsigned("TagAttachmentUID", self._uid(about))
-            target = _text("TargetType", "ATTACHMENT") + uid
-        simple = _text("TagName", name) + _text("TagString", value)
-        return _element("Tag", _element("Targets", target) + _element("SimpleTag", simple))
+            target = {"TargetType": "ATTACHMENT", "TagAttachmentUID": self._uid(about)}
+        simple = {"TagName": name, "TagString": value}
+        return _element("Tag", {"Targets": target, "SimpleTag": simple})
 
     def _write_image(self, name: str, image: np.ndarray, device_time_us: int) -> None:
         expected = self._depth_size and self._depth_size[::-1]
@@ -319,7 +302,7 @@ class MkvWriter:
             self._cluster_tracks.add(track)
         block = _size(track) + struct.pack(">h", relative)
         if name == "IMU":
-            group = _element("Block", block + b"\x00" + payload) + _unsigned("BlockDuration", 1)
+            group = {"Block": block + b"\x00" + payload, "BlockDuration": 1}
             self._cluster.append(_element("BlockGroup", group))
         else:
             head = block + b"\x80"  # a key frame
@@ -331,14 +314,14 @@ class MkvWriter:
         if not self._cluster or self._cluster_us is None:
             return
         position = self._file.tell() - self._segment_start
-        time = _unsigned("Timestamp", self._cluster_us)
+        time = _element("Timestamp", self._cluster_us)
         length = len(time) + sum(len(block) for block in self._cluster)
         self._file.write(_id("Cluster") + _size(length, 8) + time)
         self._file.writelines(self._cluster)
         track = min(self._cluster_tracks, default=self._tracks["COLOR"])
-        where = _unsigned("CueTrack", track) + _unsigned("CueClusterPosition", position)
-        where = _element("CueTrackPositions", where)
-        self._cues.append(_element("CuePoint", _unsigned("CueTime", self._cluster_us) + where))
+        where = {"CueTrack": track, "CueClusterPosition": position}
+        cue = {"CueTime": self._cluster_us, "CueTrackPositions": where}
+        self._cues.append(_element("CuePoint", cue))
         self._cluster, self._cluster_us = [], None
         self._cluster_tracks = set()
 
