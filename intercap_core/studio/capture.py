@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import rotation_exp, rotation_log
 from intercap_core.geometry.solve.time_series import runs
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress
@@ -34,7 +34,7 @@ from intercap_core.studio.measured_detector import MeasuredDetector
 from intercap_core.studio.recording import CameraRecord, Kinect
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.rig import STAGGER_S
-from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.skeleton import unit
 from intercap_core.studio.stage import StageState, StudioStage
 
 
@@ -203,7 +203,7 @@ def erring_annotation(
             intervals.append(interval)
     frame = int(rng.integers(0, max(1, stage.frames // 5)))
     pose = stage.rig.master_from_stage @ moment.stage_from_object[frame]
-    rotation = turn(np.radians(off(5.0))) @ pose[:3, :3]
+    rotation = rotation_exp(np.radians(off(5.0))) @ pose[:3, :3]
     floor = []
     for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
         point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
@@ -214,7 +214,7 @@ def erring_annotation(
         "contact": intervals,
         "object_pose": {
             "frame": frame,
-            "rotation_vector": Rotation.from_matrix(rotation).as_rotvec().round(6).tolist(),
+            "rotation_vector": rotation_log(rotation).round(6).tolist(),
             "translation": (pose[:3, 3] + off(0.010)).round(6).tolist(),
         },
         "floor": floor,

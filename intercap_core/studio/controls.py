@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -75,13 +76,13 @@ class Wander:
 
 
 @dataclass(frozen=True)
-class WristPose:
-    """Target of a wrist over N moments."""
+class PoseTrack:
+    """Rigid poses of a wrist or an object over N moments, script frame."""
 
     position: np.ndarray
-    """(N, 3) metres."""
+    """(N, 3) metres, or (3,) if constant."""
     rotation: np.ndarray
-    """(N, 3, 3) from the T-pose to the script's frame."""
+    """(N, 3, 3), of a wrist from the T-pose; (3, 3) if constant."""
 
     @property
     def matrices(self) -> np.ndarray:
@@ -89,28 +90,33 @@ class WristPose:
         return rigid(self.rotation, self.position)
 
     @classmethod
-    def of(cls, matrices: np.ndarray) -> WristPose:
-        """From (N, 4, 4)."""
-        return cls(matrices[:, :3, 3], matrices[:, :3, :3])
-
-    @classmethod
-    def still(cls, transform: np.ndarray, count: int) -> WristPose:
-        """A constant transform (4, 4) at ``count`` moments."""
-        return cls(
-            np.broadcast_to(transform[:3, 3], (count, 3)),
-            np.broadcast_to(transform[:3, :3], (count, 3, 3)),
-        )
+    def of(cls, matrices: np.ndarray) -> PoseTrack:
+        """From (N, 4, 4) or a constant pose (4, 4)."""
+        return cls(matrices[..., :3, 3], matrices[..., :3, :3])
 
     def towards(
-        self, other: WristPose, share: np.ndarray, arc: np.ndarray | None = None
-    ) -> WristPose:
-        """Move to ``other`` by ``share`` (N,), with a detour of ``arc`` (3,) metres in the
-        middle."""
+        self, goal: PoseTrack, share: np.ndarray, arc: np.ndarray | None = None
+    ) -> PoseTrack:
+        """Move to ``goal`` by ``share`` (N,), with a detour of ``arc`` (3,) metres halfway."""
         s = share[:, None]
-        position = (1 - s) * self.position + s * other.position
+        position = (1 - s) * self.position + s * goal.position
         if arc is not None:
             position = position + 4 * s * (1 - s) * arc
-        return WristPose(position, blend(self.rotation, other.rotation, share))
+        return PoseTrack(position, blend(self.rotation, goal.rotation, share))
+
+    def through(self, times: np.ndarray, *goals: tuple[Any, ...]) -> PoseTrack:
+        """Move to each goal in turn.
+
+        Args:
+            times: (N,) script times.
+            goals: track or constant pose (4, 4), start and end of the motion to it, and optionally
+                its detour as in :meth:`towards`.
+        """
+        track = self
+        for goal, start, end, *arc in goals:
+            goal = goal if isinstance(goal, PoseTrack) else PoseTrack.of(goal)
+            track = track.towards(goal, ramp(times, start, end), *arc)
+        return track
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_log
+from intercap_core.geometry.camera.transforms import (
+    apply,
+    invert,
+    rigid,
+    rotation_exp,
+    rotation_log,
+)
 from intercap_core.schemas import HAND_HELD_TRUTH
 from intercap_core.studio.capture_folder import CaptureFolder, Device, DeviceFrame
 from intercap_core.studio.controls import Wander
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.recording import Kinect, surfaces_at
-from intercap_core.studio.render import OBJECT, Photographer, RoomView
+from intercap_core.studio.render import OBJECT, RoomView
 from intercap_core.studio.sensors import DepthSensor
-from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.skeleton import unit
 from intercap_core.studio.stage import StudioStage
 
 TURNS = 1.12  # around the object: the end overlaps the start
@@ -56,7 +62,7 @@ class Walk:
         eye = (self._low + self._high) / 2 + radius * towards + self._shift(now)[0]
         right = unit(np.cross(-towards, [0, 0, 1.0]))
         rotation = np.stack([right, np.cross(-towards, right), -towards], 1)
-        return rigid(rotation @ turn(self._turn(now)[0]), eye)
+        return rigid(rotation @ rotation_exp(self._turn(now)[0]), eye)
 
 
 class CarriedKinect(Kinect):
@@ -66,15 +72,12 @@ class CarriedKinect(Kinect):
         """Write the recording; returns the true stage_from_colour (T, 4, 4)."""
         stage, times = self.stage, self.stage.set_times
         moment = stage.at(times[:1])
-        no_colours = np.zeros((len(stage.subject.rest), 3))
-        shown = [s for s in surfaces_at(stage, moment, 0, no_colours) if s.kind == OBJECT]
+        shown = [s for s in surfaces_at(stage, moment, 0) if s.kind == OBJECT]
         points = apply(moment.stage_from_object[0], stage.prop.vertices)
         self._walk = Walk(stage.noise, points, stage.duration)
-        rng = stage.noise.rng("photo", self.true.name)
-        gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
         poses = np.stack([self._walk.at(float(time)) for time in times])
         colour, depth = self._views_from(poses[0])
-        photographer = Photographer(colour, gain, rng)
+        photographer, rng = self._photographer(colour)
         sensor = DepthSensor(depth, stage.noise, self.true.name, stage.depth_mode)
         device = Device(
             self.index, self.claimed, self.serial, self.colour_mode, stage.depth_mode, True,

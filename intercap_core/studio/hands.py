@@ -14,9 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.geometry.camera.transforms import rotation_exp
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.controls import bisect
-from intercap_core.studio.skeleton import PuppetSkeleton, turn, unit
+from intercap_core.studio.skeleton import PuppetSkeleton, unit
 from intercap_core.studio.subjects import Subject
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of SMPL-X's joints
@@ -138,7 +139,7 @@ class Hand:
     def skin(self, vectors: np.ndarray) -> np.ndarray:
         """Vertices (B, n, 3) relative to the wrist, rest frame, of finger poses (B, 15, 3)."""
         local = np.broadcast_to(np.eye(3), (len(vectors), 55, 3, 3)).copy()
-        local[:, self.first : self.first + 15] = turn(vectors)
+        local[:, self.first : self.first + 15] = rotation_exp(vectors)
         posed = self._part.skin(local, np.zeros((len(vectors), 3)))
         return posed.vertices - self.rest.rest[self.wrist]
 

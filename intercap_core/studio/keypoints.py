@@ -105,11 +105,12 @@ class Detector:
         """
         noise, scale = self.noise, self.noise.scale
         rng = noise.detector_rng("keypoints", camera.name, *who)
-        per_metre = self._pixels_per_metre(camera, points)
         biased = points + np.einsum("tij,kj->tki", axes, self.body_bias)
         pose = camera.colour_from_master
         at = biased @ pose[:3, :3].T + pose[:3, 3]
         pixels = camera.colour.project(at)
+        pelvis_depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
+        per_metre = (camera.colour.fx / np.maximum(pelvis_depth, 0.3))[:, None, None]  # px
         # 1 if the subject is as large as at 2.5 m in 1080p, which is 370 px for a metre
         unit_px = per_metre / 370.0
 
@@ -151,12 +152,6 @@ class Detector:
         ).all(-1)
         confidence = np.where(inside & (depth > 0.1), confidence, 0)
         return np.concatenate([pixels, confidence[..., None]], -1)
-
-    def _pixels_per_metre(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Scale (T, 1, 1) of the image at the pelvis, px for a metre."""
-        pose = camera.colour_from_master
-        depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
-        return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
 
     def _confidence(
         self, rng: np.random.Generator, error: np.ndarray, hidden: np.ndarray

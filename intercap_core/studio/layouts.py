@@ -17,12 +17,12 @@ import av
 import cv2
 import numpy as np
 from pycocotools import mask as coco
-from scipy.spatial.transform import Rotation
 
 from intercap_core.config_types import LayoutName
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.capture_folder import (
@@ -130,7 +130,7 @@ def write_intercap_calibration(folder: Path, rig: Rig, lenses: Sequence[Intrinsi
             "f": [lens.fx, lens.fy],
             "c": [lens.cx, lens.cy],
             "k": lens.distortion.tolist(),
-            "R": Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist(),
+            "R": rotation_log(pose[:3, :3]).tolist(),
             "T": pose[:3, 3].tolist(),
         }
         _write_json(folder / (f"Color_{index}.json" if index > 1 else "Color.json"), content)

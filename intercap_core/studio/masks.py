@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from pycocotools import mask as coco
 
+from intercap_core.formats.detections.class_names import COCO_NAMES
+from intercap_core.geometry.camera.masks import encode_window
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.render import BODY, OBJECT, PASSER_BY
 
@@ -29,13 +31,7 @@ CONFUSED = {
     "bottle": ("vase", "wine glass"), "cup": ("bowl", "vase", "wine glass"),
 }  # fmt: skip
 OTHER_THINGS = ("book", "tv", "potted plant", "clock", "vase", "handbag", "chair", "bottle")
-CATEGORY_IDS = {
-    "person": 1, "bench": 15, "backpack": 27, "umbrella": 28, "handbag": 31, "tie": 32,
-    "suitcase": 33, "frisbee": 34, "snowboard": 36, "sports ball": 37, "baseball bat": 39,
-    "skateboard": 41, "surfboard": 42, "tennis racket": 43, "bottle": 44, "wine glass": 46,
-    "cup": 47, "bowl": 51, "apple": 53, "chair": 62, "potted plant": 64, "dining table": 67,
-    "toilet": 70, "tv": 72, "refrigerator": 82, "book": 84, "clock": 85, "vase": 86,
-}  # fmt: skip
+CATEGORY_IDS = {name: number for number, name in COCO_NAMES.items()}
 EPISODE_S = (0.3, 1.0)  # range of the duration of an error
 AGREEMENT = 0.5  # share of the errors' variance that all views have in common
 
@@ -270,9 +266,7 @@ class CameraMasks:
 def _encode(mask: np.ndarray, x0: int, y0: int, size: tuple[int, int]) -> dict[str, Any]:
     """COCO RLE of a window at (x0, y0), which may reach beyond the image."""
     width, height = size
-    image = np.zeros((height, width), np.uint8, order="F")
-    left, top = max(x0, 0), max(y0, 0)
-    right, bottom = min(x0 + mask.shape[1], width), min(y0 + mask.shape[0], height)
-    if right > left and bottom > top:
-        image[top:bottom, left:right] = mask[top - y0 : bottom - y0, left - x0 : right - x0]
-    return coco.encode(image)
+    left, top = max(-x0, 0), max(-y0, 0)
+    window = mask[top : max(height - y0, 0), left : max(width - x0, 0)] != 0
+    counts = encode_window(window, x0 + left, y0 + top, height, width)
+    return {"size": [height, width], "counts": counts}

@@ -16,14 +16,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
-from intercap_core.studio.controls import Footwork, WristPose, bisect, ramp
+from intercap_core.geometry.camera.transforms import rotation_exp
+from intercap_core.studio.controls import Footwork, PoseTrack, bisect, ramp
 from intercap_core.studio.hands import RELAXED, Hand, HandShape, part_of
 from intercap_core.studio.skeleton import (
     PuppetSkeleton,
     blend,
     carry,
     local_rotations,
-    turn,
     twist_angle,
     unit,
 )
@@ -60,9 +60,9 @@ def foot_rotations(heading: np.ndarray, pitch: np.ndarray, splay: float = SPLAY)
         ahead = facing(heading[:, side] + sign * splay)
         tilt = np.zeros((len(heading), 3))
         tilt[:, 0] = pitch[:, side]
-        result[:, side, 0] = ahead @ turn(tilt)
+        result[:, side, 0] = ahead @ rotation_exp(tilt)
         tilt[:, 0] = np.minimum(pitch[:, side], 0) + 0.35 * np.maximum(pitch[:, side], 0)
-        result[:, side, 1] = ahead @ turn(tilt)
+        result[:, side, 1] = ahead @ rotation_exp(tilt)
     return result
 
 
@@ -142,9 +142,9 @@ class Puppet:
         base = facing(trunk.heading)
         rotation = base
         for name, share in TRUNK.items():
-            rotation = rotation @ turn(share * trunk.bend)
+            rotation = rotation @ rotation_exp(share * trunk.bend)
             world[:, _J[name]] = rotation
-        head = base @ turn(trunk.head)
+        head = base @ rotation_exp(trunk.head)
         neck = blend(rotation, head, np.full(count, 0.45))
         world[:, _J["neck"]] = neck
         for name in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf"):
@@ -227,7 +227,7 @@ class Puppet:
 
     def idle_wrist(
         self, world: np.ndarray, pelvis: np.ndarray, side: int, swing: np.ndarray
-    ) -> WristPose:
+    ) -> PoseTrack:
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
         # the heading from the chest's left side: its front may point down and back in a deep stoop
@@ -243,14 +243,14 @@ class Puppet:
         position += (0.05 + swing)[:, None] * forward
         fingers = unit(-up + (0.10 + swing)[:, None] * forward - 0.02 * sign * left)
         palm = unit(-sign * left - 0.25 * forward)
-        return WristPose(position, self.wrist_rotation(side, fingers, palm))
+        return PoseTrack(position, self.wrist_rotation(side, fingers, palm))
 
     def wrist_rotation(self, side: int, fingers: np.ndarray, palm: np.ndarray) -> np.ndarray:
         """Rotation(s) that point the fingers and face the palm along directions (..., 3)."""
         hand = self.hands[side]
         return carry(hand.out, hand.palm, fingers, palm)
 
-    def assist(self, trunk: Trunk, targets: dict[int, tuple[WristPose, np.ndarray]]) -> Trunk:
+    def assist(self, trunk: Trunk, targets: dict[int, tuple[PoseTrack, np.ndarray]]) -> Trunk:
         """Bend the trunk at moments when an arm cannot reach its target.
 
         Each iteration turns the trunk about the pelvis, so that the shoulder moves towards the
@@ -278,7 +278,7 @@ class Puppet:
         world: np.ndarray,
         pelvis: np.ndarray,
         side: int,
-        wrist: WristPose,
+        wrist: PoseTrack,
         raised: np.ndarray | float = 0.0,
     ) -> None:
         """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
@@ -299,7 +299,7 @@ class Puppet:
         )
         forearm = unit(self.skeleton.bone(names[1], names[2]))
         roll = twist_angle(np.swapaxes(lower, -1, -2) @ wrist.rotation, forearm)
-        lower = lower @ turn(self.forearm_twist * roll[:, None] * forearm)
+        lower = lower @ rotation_exp(self.forearm_twist * roll[:, None] * forearm)
         world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
         world[:, _J[names[2]]] = wrist.rotation
         world[:, hand.first : hand.first + 15] = wrist.rotation[:, None]
@@ -320,13 +320,13 @@ class Puppet:
         """
         wrist = self.idle_wrist(world, pelvis, side, swing)
         position = sum(offsets, wrist.position)
-        self.arm_to(world, pelvis, side, WristPose(position, wrist.rotation))
+        self.arm_to(world, pelvis, side, PoseTrack(position, wrist.rotation))
         self.fingers(world, side, self.finger_track(side, []))
 
     def fingers(self, world: np.ndarray, side: int, vectors: np.ndarray) -> None:
         """Set the fingers' rotation vectors (N, 15, 3) relative to their parents, in place."""
         hand = self.hands[side]
-        local = turn(vectors)
+        local = rotation_exp(vectors)
         for joint in range(15):
             parent = hand.wrist if joint % 3 == 0 else hand.first + joint - 1
             world[:, hand.first + joint] = world[:, parent] @ local[:, joint]

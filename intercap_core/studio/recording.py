@@ -115,9 +115,7 @@ class Kinect:
         sensor = DepthSensor(
             depth_view, stage.noise, name, stage.depth_mode, large, stage.depth_errors == "stereo"
         )
-        rng = stage.noise.rng("photo", name)
-        gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
-        photographer = Photographer(colour_view, gain, rng)
+        photographer, rng = self._photographer(colour_view)
         distractor = stage.room.distractor
         clutter = colour_view.material == distractor if distractor >= 0 else None
         size = (self.true.colour.width, self.true.colour.height)
@@ -197,6 +195,12 @@ class Kinect:
             RoomView(self.true.depth, self._depth_pose, self.stage.room, coloured=False),
         )
 
+    def _photographer(self, view: RoomView) -> tuple[Photographer, np.random.Generator]:
+        """The colour camera with a white balance of its own, and its random numbers."""
+        rng = self.stage.noise.rng("photo", self.true.name)
+        gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
+        return Photographer(view, gain, rng), rng
+
     def _colour_view(self, *, coloured: bool) -> RoomView:
         pose = invert(self.stage.rig.master_from_stage) @ self.true.master_from_colour
         return RoomView(self.true.colour, pose, self.stage.room, coloured=coloured)
@@ -207,10 +211,9 @@ class Kinect:
         A second person is ignored.
         """
         view, points = self._colour_view(coloured=False), self.stage.keypoints(moment)
-        colours = np.zeros((len(self.stage.subject.rest), 3))
         hidden = np.zeros(points.shape[:2], bool)
         for t in self.sets:
-            cast = view.cast(surfaces_at(self.stage, moment, t, colours))
+            cast = view.cast(surfaces_at(self.stage, moment, t))
             hidden[t] = _hidden(cast, view, points[t])
         return hidden
 
@@ -291,11 +294,12 @@ def surfaces_at(
     stage: StudioStage,
     moment: StageState,
     t: int,
-    colours: np.ndarray,
+    colours: np.ndarray | None = None,
     passing: Passing | None = None,
 ) -> list[MovingSurface]:
-    """Clothed body, object and second person at moment ``t``, if present."""
+    """Clothed body (black without ``colours``), object and second person at ``t``, if present."""
     prop, subject = stage.prop, stage.subject
+    colours = np.zeros((len(subject.rest), 3)) if colours is None else colours
     faces = subject.faces.astype(np.int32)
 
     def person(kind: int, clothed: np.ndarray, colours: np.ndarray) -> MovingSurface:

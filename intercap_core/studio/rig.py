@@ -13,9 +13,9 @@ from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES, Mode
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.camera.transforms import invert, rigid, rotation_exp
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.skeleton import unit
 
 # Delay of each subordinate, so that the lasers do not interfere (Azure Kinect documentation)
 STAGGER_S = 160e-6
@@ -59,7 +59,7 @@ def build_rig(
     stage_from_camera = _ring(rng, cameras)
     if "no_overlap" in capture.faults:
         for pose in stage_from_camera[1:]:
-            pose[:3, :3] = turn(np.array([0, 0, np.pi])) @ pose[:3, :3]
+            pose[:3, :3] = rotation_exp(np.array([0, 0, np.pi])) @ pose[:3, :3]
     true, claimed = [], []
     master_from_stage = invert(stage_from_camera[0])
     for index in range(cameras):
@@ -71,17 +71,12 @@ def build_rig(
             master_from_stage @ stage_from_camera[index],
         )
         true.append(camera)
-        error = np.eye(4)
-        if index:  # 0.5 degrees and 10 mm at noise 1
-            error = rigid(
-                turn(unit(rng.normal(size=3)) * np.radians(0.5) * noise),
-                unit(rng.normal(size=3)) * 0.010 * noise,
-            )
         assert camera.depth is not None
-        # the error of an ill-measured mount: a turn about the camera's centre, and a shift
         pose = camera.master_from_colour.copy()
-        pose[:3, :3] = error[:3, :3] @ pose[:3, :3]
-        pose[:3, 3] += error[:3, 3]
+        if index:  # a turn of 0.5 degrees about the camera's centre and a shift of 10 mm at noise 1
+            error = rotation_exp(unit(rng.normal(size=3)) * np.radians(0.5) * noise)
+            pose[:3, :3] = error @ pose[:3, :3]
+            pose[:3, 3] += unit(rng.normal(size=3)) * 0.010 * noise
         claimed.append(
             replace(
                 camera,
@@ -141,7 +136,7 @@ def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
         forward = unit(aim - eye)
         right = unit(np.cross(forward, [0, 0, 1.0]))
         rotation = np.stack([right, np.cross(forward, right), forward], 1)
-        roll = turn(np.array([0, 0, np.radians(rng.uniform(-1.5, 1.5))]))
+        roll = rotation_exp(np.array([0, 0, np.radians(rng.uniform(-1.5, 1.5))]))
         poses.append(rigid(rotation @ roll, eye))
     return poses
 
@@ -196,7 +191,7 @@ def _in_mode(lens: Intrinsics, mode: Mode, other: Mode) -> Intrinsics:
 def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
     """As in real devices' calibrations, the depth camera looks down by 5.6 degrees."""
     tilt = np.array([np.radians(-5.6), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
-    return rigid(turn(tilt), np.array([-0.0320, -0.0021, 0.0039]) + rng.normal(0, 2e-4, 3))
+    return rigid(rotation_exp(tilt), np.array([-0.0320, -0.0021, 0.0039]) + rng.normal(0, 2e-4, 3))
 
 
 def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> Intrinsics:

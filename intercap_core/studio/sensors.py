@@ -274,11 +274,7 @@ def _events(stage: StudioStage) -> list[_Event]:
     """Sounds of the capture, equal for all cameras: steps below the person, syllables at the
     mouth."""
     rng = stage.noise.rng("sound")
-    played = stage.interaction.perform(
-        stage.interaction.script_times(stage.set_times, stage.duration)
-    )
-    place = stage.stage_from_script
-    pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
+    _, pelvis, _ = stage.play(stage.set_times)
 
     def person(time_s: float) -> np.ndarray:
         return np.array([np.interp(time_s, stage.set_times, axis) for axis in pelvis.T])

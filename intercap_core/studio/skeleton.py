@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
+from intercap_core.geometry.camera.transforms import rotation_exp, rotation_log
 
 # Shares of a limb's length. A limb reaches targets up to the first share exactly. Beyond it, the
 # limb stretches less and less, at most to the second share: knees and elbows that become straight
@@ -27,13 +28,6 @@ def unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
 
-def turn(rotation_vector: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
-    vector = np.asarray(rotation_vector, float)
-    matrices = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
-    return matrices.reshape(*vector.shape[:-1], 3, 3)
-
-
 def about_z(angle: float) -> np.ndarray:
     """Rotation (3, 3) by ``angle`` rad about the vertical."""
     cos, sin = np.cos(angle), np.sin(angle)
@@ -42,8 +36,8 @@ def about_z(angle: float) -> np.ndarray:
 
 def blend(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Rotations (N, 3, 3) from ``a`` to ``b`` along the shortest way, ``share`` (N,) of it."""
-    way = Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).as_rotvec()
-    return a @ turn(way * np.asarray(share)[..., None])
+    way = rotation_log(np.swapaxes(a, -1, -2) @ b)
+    return a @ rotation_exp(way * share[..., None])
 
 
 def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ Stage frame: z up, the floor at z = 0, metres. Scripts have a frame of their own
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,10 +14,9 @@ import numpy as np
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.config_types import LayoutName
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.studio.capture_folder import SWAPPED
 from intercap_core.studio.interactions import interaction_named
@@ -127,24 +125,12 @@ class StudioStage:
 
     def _passer_by(self, eyes: np.ndarray, *, stands: bool) -> PasserBy:
         """The second person; ``eyes``: (C, 2) places of the cameras on the floor."""
-        played = self.interaction.perform(
-            self.interaction.script_times(self.set_times, self.duration)
-        )
-        place = self.stage_from_script
-        pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
-        prop = (
-            (place @ played.script_from_object)[:, :2, 3] if self.prop else np.full((1, 2), np.inf)
-        )
+        _, pelvis, stage_from_object = self.play(self.set_times)
+        prop = stage_from_object[:, :2, 3] if self.prop else np.full((1, 2), np.inf)
         return PasserBy(
-            self.noise,
-            self.subject,
-            self.room,
-            eyes,
-            self.set_times,
-            pelvis[:, :2],
-            prop,
+            self.noise, self.subject, self.room, eyes, self.set_times, pelvis[:, :2], prop,
             stands=stands,
-        )
+        )  # fmt: skip
 
     def _highlight(self) -> np.ndarray:
         """Place (2,) of the object on the floor plan at the highlight."""
@@ -166,14 +152,20 @@ class StudioStage:
         """The open body, for the names of its points."""
         return BodyModel.load()
 
+    def play(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Play the script at recording times (N,), seconds since the first set.
+
+        Returns joint rotations (N, 55, 3, 3), the pelvis (N, 3) and object poses (N, 4, 4) in the
+        stage frame.
+        """
+        played = self.interaction.perform(self.interaction.script_times(times, self.duration))
+        place = self.stage_from_script
+        pelvis = apply(place, played.pelvis)
+        return place[:3, :3] @ played.world, pelvis, place @ played.script_from_object
+
     def at(self, times: np.ndarray) -> StageState:
         """State at recording times (N,), seconds since the first set."""
-        script = self.interaction.script_times(times, self.duration)
-        played = self.interaction.perform(script)
-        place = self.stage_from_script
-        world = place[:3, :3] @ played.world
-        pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
-        stage_from_object = place @ played.script_from_object
+        world, pelvis, stage_from_object = self.play(times)
         posed = self.puppet.skin(world, pelvis)
         body, clothed = posed.vertices.copy(), posed.clothed.copy()
         for n in range(len(times) if self.prop else 0):
@@ -207,6 +199,8 @@ def check_capture(
     """Raise UserError for a capture that the studio cannot play."""
     kind, people = interaction_named(capture.interaction), (*subject_names(), *build_names())
     layout, wanted = capture.layout, kind.object_class
+    faults, cameras, frames = capture.faults, settings.cameras, capture.frames
+    foreign = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
     for is_wrong, text in (
         (
             (object_name or "") != wanted,
@@ -252,11 +246,29 @@ def check_capture(
             capture.sound and not capture.video,
             "only videos carry sound; take 'sound' out or set video: true and layout: plain",
         ),
+        (
+            foreign,
+            f"recordings of layout {layout!r} cannot have fault {min(foreign, default='')}; take "
+            "the fault out or choose another layout",
+        ),
+        (
+            "swapped_lenses" in faults and cameras <= max(SWAPPED),
+            f"fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more",
+        ),
+        (
+            faults and cameras < 2,
+            f"faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; use more "
+            "cameras or no faults",
+        ),
+        (
+            {"dead_half", "backwards_clock"} & set(faults) and frames < 4,
+            f"faults dead_half and backwards_clock need 4 frames, 'frames' is {frames}; make the "
+            "capture longer or take the fault out",
+        ),
     ):
         if is_wrong:
             raise UserError(f"studio: {text}")
     _check_rates(capture, settings)
-    check_faults(capture.faults, layout=layout, cameras=settings.cameras, frames=capture.frames)
 
 
 def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
@@ -283,34 +295,6 @@ def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
         ):
             if is_wrong:
                 raise UserError(f"studio: {text}")
-
-
-def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, frames: int) -> None:
-    """Raise UserError for faults that a capture cannot have."""
-    foreign = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
-    for is_wrong, text in (
-        (
-            foreign,
-            f"recordings of layout {layout!r} cannot have fault {min(foreign, default='')}; take "
-            "the fault out or choose another layout",
-        ),
-        (
-            "swapped_lenses" in faults and cameras <= max(SWAPPED),
-            f"fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more",
-        ),
-        (
-            faults and cameras < 2,
-            f"faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; use more "
-            "cameras or no faults",
-        ),
-        (
-            {"dead_half", "backwards_clock"} & set(faults) and frames < 4,
-            f"faults dead_half and backwards_clock need 4 frames, 'frames' is {frames}; make the "
-            "capture longer or take the fault out",
-        ),
-    ):
-        if is_wrong:
-            raise UserError(f"studio: {text}")
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:

@@ -21,6 +21,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import FIRST_FINGER, JOINT_INDEX, NUM_JOINTS, PARENTS
+from intercap_core.geometry.camera.transforms import rotation_exp
+from intercap_core.studio.skeleton import PuppetSkeleton
 
 # The twelve standard people; people of other builds, whose file has only the arrays that differ.
 SUBJECTS_FILE = Path(__file__).parent / "data" / "subjects.npz"
@@ -112,8 +114,13 @@ class Subject:
             pose: local rotations (B,55,3,3), or axis-angle (B,165) or (B,55,3), in SMPL-X's order.
             transl: (B,3) metres, added to the rest position as in SMPL-X.
         """
-        local = _matrices(pose)
-        world, joints = self._chain(local, np.asarray(transl, np.float64))
+        is_local = pose.shape[1:] == (NUM_JOINTS, 3, 3)
+        local = pose if is_local else rotation_exp(pose.reshape(len(pose), NUM_JOINTS, 3))
+        world = local.copy()
+        for k in range(1, NUM_JOINTS):
+            world[:, k] = world[:, PARENTS[k]] @ local[:, k]
+        pelvis = self.rest_joints[0] + transl
+        joints = PuppetSkeleton(self.rest_joints).forward(world, pelvis)
         offsets = joints - np.einsum("bkij,kj->bki", world, self.rest_joints)
         rest = self._flexed(local)
         vertices = self._blend(world, offsets, rest)
@@ -136,18 +143,6 @@ class Subject:
     def rest_clothed(self) -> np.ndarray:
         """The clothed surface (V,3) in the T-pose."""
         return self.rest + self.normals(self.rest[None])[0] * self.clothing[:, None]
-
-    def _chain(self, local: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World rotations (B,55,3,3) and joints (B,55,3) of local rotations (B,55,3,3)."""
-        world = np.empty_like(local)
-        joints = np.empty((len(local), NUM_JOINTS, 3))
-        world[:, 0], joints[:, 0] = local[:, 0], self.rest_joints[0] + transl
-        for k in range(1, NUM_JOINTS):
-            p = PARENTS[k]
-            bone = self.rest_joints[k] - self.rest_joints[p]
-            joints[:, k] = joints[:, p] + world[:, p] @ bone
-            world[:, k] = world[:, p] @ local[:, k]
-        return world, joints
 
     def _flexed(self, local: np.ndarray) -> np.ndarray:
         """(B,V,3) rest vertices with the bulges of the bent joints."""
@@ -236,14 +231,6 @@ def _blend_one(mixed, rest, out):
             m = mixed[v, 3 * axis : 3 * axis + 3]
             linear = m[0] * x + m[1] * y + m[2] * z + mixed[v, 9 + axis]
             out[v, axis] = linear + _DUAL_QUATERNION_SHARE * (moved[axis] - linear)
-
-
-def _matrices(pose: np.ndarray) -> np.ndarray:
-    pose = np.asarray(pose, np.float64)
-    if pose.shape[1:] == (NUM_JOINTS, 3, 3):
-        return pose
-    vectors = pose.reshape(-1, 3)
-    return Rotation.from_rotvec(vectors).as_matrix().reshape(len(pose), NUM_JOINTS, 3, 3)
 
 
 def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

@@ -156,6 +156,7 @@ def test_depth_unseen_by_the_depth_camera_is_empty() -> None:
     on_card = (aligned > 0) & (np.abs(aligned - card) < 1)
     on_wall = (aligned > 0) & (np.abs(aligned - wall) < 1)
     assert (on_card | on_wall | (aligned == 0)).all()
+    assert on_wall[150:190, 400:880].all()
     corners = np.array([[250, 200], [399, 379]])
     at = camera.colour.project(
         apply(camera.colour_from_depth, camera.depth.unproject(corners) * 0.9)
@@ -197,15 +198,3 @@ def test_aligned_depth_is_that_of_the_colour_camera():
         assert np.median(error) < 1.2 and np.percentile(error, 90) < 4
         # Beyond that only silhouettes differ, where the two cameras see different surfaces.
         assert (error > 100).mean() < 0.02
-
-
-def test_aligned_surfaces_are_whole_and_near_ones_win():
-    rig, _ = ring(count=1)
-    camera = replace(rig[0], colour=rig[0].colour.scaled(0.5))
-    far = np.full((camera.depth.height, camera.depth.width), 3000, np.uint16)
-    middle = Aligner(camera).align(far)[200:340, 350:610]
-    assert (middle > 0).all()
-    near = far.copy()
-    near[70:110, 80:120] = 1000
-    found = Aligner(camera).align(near)
-    assert ((found > 900) & (found < 1100)).sum() > 40 * 40

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp
 from intercap_core.studio.render import (
     BODY,
     OBJECT,
@@ -18,7 +18,6 @@ from intercap_core.studio.render import (
 )
 from intercap_core.studio.rig import build_rig
 from intercap_core.studio.room import build_room
-from intercap_core.studio.skeleton import turn
 from intercap_core.studio.subjects import Subject
 
 
@@ -26,12 +25,12 @@ from intercap_core.studio.subjects import Subject
 def surfaces() -> tuple[MovingSurface, MovingSurface]:
     """A person in the T-pose on the floor and a ball before the chest, colours by place."""
     subject = Subject.load("s01")
-    upright = turn(np.array([np.pi / 2, 0, 0]))  # the rest pose has y up
+    upright = rotation_exp(np.array([np.pi / 2, 0, 0]))  # the rest pose has y up
     posed = subject.rest @ upright.T
     posed = posed - (0, 0, posed[:, 2].min())
     normals = subject.normals(posed[None])[0]
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.15)
-    place = rigid(turn(np.array([0.3, 0.2, 0.1])), np.array([0.25, 0.3, 1.2]))
+    place = rigid(rotation_exp(np.array([0.3, 0.2, 0.1])), np.array([0.25, 0.3, 1.2]))
     return (
         MovingSurface(BODY, posed, subject.faces, normals, 0.5 + 0.2 * posed, np.eye(4)),
         MovingSurface(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Step, WristPose, plateau
+from intercap_core.studio.controls import PoseTrack, Step, plateau
 from intercap_core.studio.hands import shape
 from intercap_core.studio.interactions.base import Interaction, Performance
 from intercap_core.studio.motion import LEFT, RIGHT, SIDES, Foot, Trunk
@@ -127,7 +127,7 @@ class WalkAndWave(Interaction):
         trunk.head[:, 1] += 0.3 * np.sign(self.turned) * plateau(times, 0.5, 0.9, 1.4, 1.8)
         return trunk
 
-    def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """Poses (N) of the raised wrist, the palm facing ahead."""
         puppet, sign = self.puppet, (1.0, -1.0)[self.side]
         left, up, ahead = (world[:, 9, :, axis] for axis in range(3))
@@ -137,7 +137,7 @@ class WalkAndWave(Interaction):
         )
         fingers = unit(up + (wave / puppet.arm) * left + 0.15 * ahead)
         rotation = puppet.wrist_rotation(self.side, fingers, unit(ahead - 0.15 * up))
-        return WristPose(place + wave * left, rotation)
+        return PoseTrack(place + wave * left, rotation)
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet

@@ -118,6 +118,11 @@ def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
     return rigid(about_z(heading), np.array([x, y, z]))
 
 
+def shifted(pose: np.ndarray, by: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """Poses (..., 4, 4) moved by metres (..., 3)."""
+    return rigid(pose[..., :3, :3], pose[..., :3, 3] + by)
+
+
 def held_object(
     puppet: Puppet, world: np.ndarray, pelvis: np.ndarray, side: int, object_from_wrist: np.ndarray
 ) -> np.ndarray:

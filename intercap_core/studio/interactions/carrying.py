@@ -9,12 +9,17 @@ from itertools import product
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
+from intercap_core.geometry.camera.transforms import rigid, rotation_exp
+from intercap_core.studio.controls import PoseTrack, Step, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED, HandShape, shape
-from intercap_core.studio.interactions.base import Interaction, Performance, held_object, upright
+from intercap_core.studio.interactions.base import (
+    Interaction,
+    Performance,
+    held_object,
+    shifted,
+    upright,
+)
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
-from intercap_core.studio.skeleton import turn
 
 
 class HandleCarry(Interaction):
@@ -129,7 +134,7 @@ class HandleCarry(Interaction):
         )
         return trunk
 
-    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """Wrist (N): hanging, over and beside the handle, on it, carrying, and back the same way.
 
         ``first`` and ``last`` are the wrist's poses on the handle at pick-up and put-down.
@@ -137,40 +142,33 @@ class HandleCarry(Interaction):
         count = len(times)
         swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
         idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
-        first, last = (
-            self.pick_pose @ self.object_from_wrist,
-            self.place_pose @ self.object_from_wrist,
-        )
-        aside = np.array([0.0, -0.085, 0.0])
-        before, after = first.copy(), last.copy()
-        before[:3, 3] += aside
-        after[:3, 3] += aside
-        over, off = before.copy(), after.copy()
-        over[:3, 3] += (-0.03, -0.03, self.above)
-        off[:3, 3] += (-0.02, -0.04, self.above)
+        first, last = (p @ self.object_from_wrist for p in (self.pick_pose, self.place_pose))
+        before, after = (shifted(pose, (0.0, -0.085, 0.0)) for pose in (first, last))
+        over = shifted(before, (-0.03, -0.03, self.above))
+        off = shifted(after, (-0.02, -0.04, self.above))
         held = np.array([0.0, first[1, 3], first[2, 3] + self.lift])
-        along = pelvis[:, 0] + (first[0, 3] - self.pick_pose[0, 3]) - 0.02
         position = np.broadcast_to(held, (count, 3)).copy()
         share = ramp(times, 1.2, 2.3)
-        position[:, 0] = along
+        position[:, 0] = pelvis[:, 0] + (first[0, 3] - self.pick_pose[0, 3]) - 0.02
         position[:, 1] += share * (last[1, 3] - first[1, 3])
         position[:, 2] += 0.006 * np.sin(2 * np.pi * times / 0.41)
         tilt = np.zeros((count, 3))
         tilt[:, 1] = (
             0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(times, 1.2, 1.5, 1.9, 2.2)
         )
-        between = WristPose.still(first, count).towards(WristPose.still(last, count), share)
-        carried = WristPose(position, turn(tilt) @ between.rotation)
-        wrist = idle.towards(WristPose.still(over, count), ramp(times, 0.25, 0.90))
-        wrist = wrist.towards(WristPose.still(before, count), ramp(times, 0.62, 0.95))
-        wrist = wrist.towards(WristPose.still(first, count), ramp(times, 0.94, 1.04))
-        wrist = wrist.towards(carried, ramp(times, self.attach_s, self.lifted_s))
-        wrist = wrist.towards(
-            WristPose.still(last, count), ramp(times, self.lower_s, self.release_s - 0.02)
+        between = PoseTrack.of(first).towards(PoseTrack.of(last), share)
+        carried = PoseTrack(position, rotation_exp(tilt) @ between.rotation)
+        return idle.through(
+            times,
+            (over, 0.25, 0.90),
+            (before, 0.62, 0.95),
+            (first, 0.94, 1.04),
+            (carried, self.attach_s, self.lifted_s),
+            (last, self.lower_s, self.release_s - 0.02),
+            (after, 2.53, 2.65),
+            (off, 2.62, 2.86),
+            (idle, 2.80, 3.40),
         )
-        wrist = wrist.towards(WristPose.still(after, count), ramp(times, 2.53, 2.65))
-        wrist = wrist.towards(WristPose.still(off, count), ramp(times, 2.62, 2.86))
-        return wrist.towards(idle, ramp(times, 2.80, 3.40))
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet = self.puppet
@@ -189,7 +187,7 @@ class HandleCarry(Interaction):
         swing = -0.10 * bump(times, 0.0, 0.5) + 0.14 * bump(times, 1.2, 1.7)
         left = puppet.idle_wrist(world, pelvis, LEFT, swing + self.arm_swing(times)[:, 1])
         balance = plateau(times, 0.7, 1.0, 2.5, 2.9)[:, None]
-        left = WristPose(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
+        left = PoseTrack(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
         puppet.arm_to(world, pelvis, LEFT, left)
         stages: list[tuple[np.ndarray, HandShape]] = [
             (ramp(times, 0.5, 0.88), self.hook),

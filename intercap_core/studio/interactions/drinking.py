@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.studio.controls import WristPose, bisect, plateau, ramp
+from intercap_core.geometry.camera.transforms import rigid, rotation_exp
+from intercap_core.studio.controls import PoseTrack, bisect, plateau, ramp
 from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
+from intercap_core.studio.interactions.base import shifted
 from intercap_core.studio.interactions.grasps import backed_off
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
-from intercap_core.studio.skeleton import turn
 
 
 class Drinking(HandlingScript):
@@ -110,40 +110,36 @@ class Drinking(HandlingScript):
         trunk.head[:, 1] -= 0.12 * reach
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """From the plinth to the lips, tilted there, and back."""
-        count = len(times)
         place = self.puppet.joint(world, pelvis, "head")
         head = rigid(world[:, JOINT_INDEX["head"]], place)
         at_lips = head @ self.head_from_prop
         # before and after the drink it is upright, a little lower and ahead of the lips
         upright_share = 1 - plateau(times, 1.45, 1.80, 2.00, 2.30)
-        ease = np.zeros((count, 3))
+        ease = np.zeros((len(times), 3))
         ease[:, 0] = upright_share * self.tilt * 0.85
         away = head[:, :3, :3] @ np.array([0.0, -0.035, 0.055])
         position = at_lips[:, :3, 3] + upright_share[:, None] * away
-        drinking = WristPose(position, at_lips[:, :3, :3] @ turn(ease))
+        drinking = PoseTrack(position, at_lips[:, :3, :3] @ rotation_exp(ease))
         lift = np.array([0.0, 0, 0.05])
-        prop = WristPose.still(self.pick_pose, count)
-        prop = prop.towards(drinking, ramp(times, self.attach_s, 1.72), lift)
-        return prop.towards(
-            WristPose.still(self.place_pose, count), ramp(times, 2.02, self.release_s - 0.03), lift
+        return PoseTrack.of(self.pick_pose).through(
+            times,
+            (drinking, self.attach_s, 1.72, lift),
+            (self.place_pose, 2.02, self.release_s - 0.03, lift),
         )
 
     def wrist(
         self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, prop: np.ndarray
-    ) -> WristPose:
+    ) -> PoseTrack:
         """The right hand handles the vessel; the left only comes near."""
         wrist = super().wrist(side, world, pelvis, times, prop)
         if side == RIGHT:
             return wrist
-        count = len(times)
-        away = self.left_place.copy()
-        away[:3, 3] += (-0.10, 0.10, 0.10)
-        near = wrist.towards(WristPose.still(away, count), ramp(times, 0.2, 0.75))
-        near = near.towards(WristPose.still(self.left_place, count), ramp(times, 0.65, 0.95))
-        near = near.towards(WristPose.still(away, count), ramp(times, 1.02, 1.3))
-        return near.towards(wrist, ramp(times, 1.2, 1.8))
+        near, away = self.left_place, shifted(self.left_place, (-0.10, 0.10, 0.10))
+        return wrist.through(
+            times, (away, 0.2, 0.75), (near, 0.65, 0.95), (away, 1.02, 1.3), (wrist, 1.2, 1.8)
+        )
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
         """The left hand opens while it hovers."""

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import rotation_exp
 from intercap_core.studio.controls import Guide, Step, bisect, bump, plateau, ramp
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
-from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.skeleton import unit
 
 
 class FootballKick(Interaction):
@@ -40,7 +41,7 @@ class FootballKick(Interaction):
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
         self.radius = float(np.linalg.norm(self.prop.vertices, axis=1).mean())
-        self.first_turn = turn(unit(rng.normal(size=3)) * rng.uniform(0, np.pi))
+        self.first_turn = rotation_exp(unit(rng.normal(size=3)) * rng.uniform(0, np.pi))
         lowest = float((self.prop.vertices @ self.first_turn[2]).min())
         self.spot = np.array([0.24 + rng.uniform(0, 0.04), -puppet.hip_width, -lowest])
         direction = rng.normal(0, 0.06)
@@ -139,7 +140,7 @@ class FootballKick(Interaction):
         pose = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
         axis = np.cross([0, 0, 1.0], self.ahead)
         turned = np.interp(times, self.clock, self.turned)
-        pose[:, :3, :3] = turn(turned[:, None] * axis) @ self.first_turn
+        pose[:, :3, :3] = rotation_exp(turned[:, None] * axis) @ self.first_turn
         moved = np.interp(times, self.clock, self.moved)
         pose[:, :2, 3] = (self.spot + moved[:, None] * self.ahead)[:, :2]
         pose[:, 2, 3] = -(pose[:, 2, :3] @ self.prop.vertices.T).min(1)

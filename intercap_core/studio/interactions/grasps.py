@@ -50,13 +50,18 @@ def backed_off(
     away: np.ndarray,
     gap: float,
     ids: np.ndarray | slice = slice(None),
+    *,
+    reach_m: tuple[float, float] = (0.0, 0.25),
+    steps: int = 16,
 ) -> np.ndarray:
     """Move a wrist away from the object until the hand has a gap.
 
     Args:
         wrist: (4, 4) first pose, script frame.
-        away: (3,) unit direction, script frame; the wrist moves at most a quarter of a metre.
+        away: (3,) unit direction, script frame.
         gap: distance of the object from the hand's vertices ``ids``, metres; negative: pressed in.
+        reach_m: least and largest motion of the wrist, metres.
+        steps: number of bisections.
 
     Returns:
         (4, 4) pose of the wrist, script frame.
@@ -69,7 +74,7 @@ def backed_off(
     def is_too_near(way: float) -> bool:
         return hand.gap(hand_shape, surface, object_from_script @ moved(way), ids) < gap
 
-    return moved(bisect(0.0, 0.25, 16, is_too_near)[1])
+    return moved(bisect(*reach_m, steps, is_too_near)[1])
 
 
 class Hollow:

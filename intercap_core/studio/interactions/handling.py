@@ -10,9 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.studio.controls import Step, WristPose, ramp
+from intercap_core.geometry.camera.transforms import rotation_exp
+from intercap_core.studio.controls import PoseTrack, Step, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
-from intercap_core.studio.interactions.base import Interaction, Performance, held_object, upright
+from intercap_core.studio.interactions.base import (
+    Interaction,
+    Performance,
+    held_object,
+    shifted,
+    upright,
+)
 from intercap_core.studio.interactions.grasps import (
     Approach,
     Grip,
@@ -22,7 +29,6 @@ from intercap_core.studio.interactions.grasps import (
 )
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk, facing
 from intercap_core.studio.room import Box
-from intercap_core.studio.skeleton import turn
 
 SIDES = (RIGHT, LEFT)  # order in which hands are handled here; `motion.SIDES` has their names
 
@@ -68,11 +74,8 @@ class HandlingScript(Interaction):
         super().__post_init__()
 
     @abstractmethod
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
-        """Planned poses (N) of the object, from ``pick_pose`` to ``place_pose``.
-
-        :class:`WristPose` serves here as a rigid pose over time.
-        """
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
+        """Planned poses (N) of the object, from ``pick_pose`` to ``place_pose``."""
 
     @abstractmethod
     def trunk(self, times: np.ndarray) -> Trunk:
@@ -105,12 +108,19 @@ class HandlingScript(Interaction):
 
     def grasp(self) -> None:
         """Plan the grips: the right hand around the object's wall, or the object between palms."""
-        times = (self.attach_s, self.release_s)
-        if self.grip_height_m is None:
-            self.grips, self.hold_s = between_palms(self), dict.fromkeys(SIDES, times)
+        surface, pose, floor = self.prop.surface, self.pick_pose, self.top + self.fingers_rest_m
+        if self.grip_height_m is not None:
+            # above the object's origin, or higher if the plinth is in the way
+            at = pose[:3, 3] + (0, 0, self.grip_height_m)
+            self.grips[RIGHT] = wrapped(self.puppet, surface, pose, around_wall(at, floor))
         else:
-            self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
-            self.hold_s = {RIGHT: times}
+            for side, inward in zip(SIDES, (1.0, -1.0), strict=True):
+                ahead, aside, up = self.palms_m
+                at = pose[:3, 3] + (ahead, -inward * aside, up)
+                fingers = np.array([0.9, 0.25 * inward, -0.35])  # ahead and slightly down
+                approach = Approach(at, fingers, np.array([0.15, inward, 0.18]), floor=floor)
+                self.grips[side] = laid_on(self.puppet, side, surface, pose, approach)
+        self.hold_s = dict.fromkeys(self.grips, (self.attach_s, self.release_s))
 
     def table(
         self,
@@ -172,7 +182,7 @@ class HandlingScript(Interaction):
 
     def before_chest(
         self, world: np.ndarray, origin: np.ndarray, offset: np.ndarray, about: np.ndarray
-    ) -> WristPose:
+    ) -> PoseTrack:
         """Poses (N) of the object held in front of the person.
 
         Args:
@@ -181,11 +191,12 @@ class HandlingScript(Interaction):
         """
         person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
         heading = person @ facing(np.zeros(1))[0].T
-        return WristPose(origin + person @ offset, heading @ turn(about) @ self.pick_pose[:3, :3])
+        turned = heading @ rotation_exp(about)
+        return PoseTrack(origin + person @ offset, turned @ self.pick_pose[:3, :3])
 
     def wrist(
         self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, prop: np.ndarray
-    ) -> WristPose:
+    ) -> PoseTrack:
         """Wrist poses (N) of a hand: to the object ``prop`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
@@ -194,19 +205,20 @@ class HandlingScript(Interaction):
         (on, end), q = self.hold_s[side], self.haste.get(side, 1.0)
         hand = self.puppet.hands[side]
         at = prop @ self.object_from_wrist(side, times)
-        off = at.copy()
-        off[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
-        over = off.copy()
+        away = -self.clear_m * hand.palm - self.back_m * hand.out
+        off = shifted(at, at[:, :3, :3] @ away)
         # a hand under the object, palm up, does not pass over it
         raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)
-        over[:, :3, 3] += raised * self.over_m - 0.06 * (at[:, :3, :3] @ hand.out)
-        goal, near, far = (WristPose.of(matrices) for matrices in (at, off, over))
-        wrist = idle.towards(far, ramp(times, on - 0.90 * q, on - 0.38 * q))
-        wrist = wrist.towards(near, ramp(times, on - 0.50 * q, on - 0.20 * q))
-        wrist = wrist.towards(goal, ramp(times, on - 0.26 * q, on - 0.06 * q))
-        wrist = wrist.towards(near, ramp(times, end + 0.08 * q, end + 0.26 * q))
-        wrist = wrist.towards(far, ramp(times, end + 0.18 * q, end + 0.44 * q))
-        return wrist.towards(idle, ramp(times, end + 0.30 * q, end + 0.80 * q))
+        over = shifted(off, raised * self.over_m - 0.06 * (at[:, :3, :3] @ hand.out))
+        return idle.through(
+            times,
+            (over, on - 0.90 * q, on - 0.38 * q),
+            (off, on - 0.50 * q, on - 0.20 * q),
+            (at, on - 0.26 * q, on - 0.06 * q),
+            (off, end + 0.08 * q, end + 0.26 * q),
+            (over, end + 0.18 * q, end + 0.44 * q),
+            (idle, end + 0.30 * q, end + 0.80 * q),
+        )
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
         """Hand shapes over time, as `Puppet.finger_track` takes them."""
@@ -256,33 +268,3 @@ class HandlingScript(Interaction):
         on = max(on, self.rests_until_s)
         pose = np.where((times <= on)[:, None, None], self.pick_pose, held)
         return np.where((times >= off)[:, None, None], self.place_pose, pose)
-
-
-def between_palms(script: HandlingScript) -> dict[int, Grip]:
-    """Grip with a palm on either side of the object, fingers ahead and slightly down."""
-    grips = {}
-    for side in SIDES:
-        inward = (-1.0, 1.0)[side]
-        ahead, aside, up = script.palms_m
-        at = script.pick_pose[:3, 3] + (ahead, -inward * aside, up)
-        approach = Approach(at, np.array([0.9, 0.25 * inward, -0.35]),
-                            np.array([0.15, inward, 0.18]),
-                            floor=script.top + HandlingScript.fingers_rest_m)  # fmt: skip
-        grips[side] = laid_on(script.puppet, side, script.prop.surface, script.pick_pose, approach)
-    return grips
-
-
-def by_the_wall(script: HandlingScript, height: float) -> Grip:
-    """Grip of the right hand around an upright wall.
-
-    ``height``: of the palm above the object's origin, metres; more if the plinth is in the way.
-    """
-    at = script.pick_pose[:3, 3] + (0, 0, height)
-    approaches = around_wall(at, script.top + HandlingScript.fingers_rest_m)
-    return wrapped(script.puppet, script.prop.surface, script.pick_pose, approaches)
-
-
-def palm_below(script: HandlingScript) -> Grip:
-    """Grip with the object's bottom on the left palm, fingers ahead and to the right."""
-    below = Approach(script.pick_pose[:3, 3], np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0]))
-    return laid_on(script.puppet, LEFT, script.prop.surface, script.pick_pose, below)

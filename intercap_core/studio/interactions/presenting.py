@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
+from intercap_core.studio.controls import PoseTrack, Step, bump, plateau
 from intercap_core.studio.interactions.base import upright
-from intercap_core.studio.interactions.handling import HandlingScript, palm_below
+from intercap_core.studio.interactions.grasps import Approach, laid_on
+from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 
 
@@ -43,7 +44,11 @@ class Checking(HandlingScript):
         self.order = self.rng.choice([-1.0, 1.0], 2)  # to which side first
         self.grasp()
         if self.second_hand:
-            self.grips[LEFT] = palm_below(self)
+            # the object's bottom on the left palm, fingers ahead and to the right
+            fingers, palm = np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0])
+            below = Approach(self.pick_pose[:3, 3], fingers, palm)
+            pose = self.pick_pose
+            self.grips[LEFT] = laid_on(self.puppet, LEFT, self.prop.surface, pose, below)
             self.hold_s[LEFT] = (self.join_s, self.part_s)
             self.haste[LEFT] = 0.6
 
@@ -69,19 +74,16 @@ class Checking(HandlingScript):
         about[:, 0] = roll * second * bump(times, 1.45, 2.1)
         return about
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """From the plinth to before the eyes, turned there about three axes, and back."""
-        count = len(times)
         head = self.puppet.joint(world, pelvis, "head")
         offset = self.puppet.arm * np.array(self.before_eyes)
         shown = self.before_chest(world, head, offset, self.turned(times))
         lift = np.array([0.0, 0, 0.04])
-        prop = WristPose.still(self.pick_pose, count)
-        prop = prop.towards(shown, ramp(times, self.attach_s, self.raised_s[0]), lift)
-        return prop.towards(
-            WristPose.still(self.place_pose, count),
-            ramp(times, self.raised_s[1], self.release_s - 0.03),
-            lift,
+        return PoseTrack.of(self.pick_pose).through(
+            times,
+            (shown, self.attach_s, self.raised_s[0], lift),
+            (self.place_pose, self.raised_s[1], self.release_s - 0.03, lift),
         )
 
 
@@ -127,9 +129,9 @@ class LookingOn(HandlingScript):
         look = plateau(times, 0.8, 1.3, 2.0, 2.6)
         return self.leaning(times, 0.3 * look, 0.3 * look)
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """At rest."""
-        return WristPose.still(self.pick_pose, len(times))
+        return PoseTrack.of(np.broadcast_to(self.pick_pose, (len(times), 4, 4)))
 
     def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
         return self.path(world, pelvis, times).matrices
@@ -187,19 +189,17 @@ class PassingOn(HandlingScript):
         trunk.head[:, 1] += 0.30 * plateau(times, 1.0, 1.3, 1.5, 1.9)
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """From the plinth to before the belly, held out, to the other plinth."""
-        count = len(times)
-        level = np.zeros((count, 3))
+        level = np.zeros((len(times), 3))
         lift = np.array([0.0, 0, 0.04])
         carried = self.before_chest(world, pelvis, np.array(self.carried), level)
         offer = np.array([self.carried[0], self.offered_up_m, 0.93 * self.puppet.arm])
         level[:, 1] = 0.20  # tipped a little to whom it is offered
         offered = self.before_chest(world, pelvis, offer, level)
-        prop = WristPose.still(self.pick_pose, count).towards(
-            carried, ramp(times, self.attach_s, 1.42), lift
-        )
-        prop = prop.towards(offered, ramp(times, 1.62, 2.05))
-        return prop.towards(
-            WristPose.still(self.place_pose, count), ramp(times, 2.12, self.release_s - 0.03), lift
+        return PoseTrack.of(self.pick_pose).through(
+            times,
+            (carried, self.attach_s, 1.42, lift),
+            (offered, 1.62, 2.05),
+            (self.place_pose, 2.12, self.release_s - 0.03, lift),
         )

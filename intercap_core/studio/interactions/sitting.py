@@ -11,19 +11,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.controls import (
     Footwork,
     Guide,
+    PoseTrack,
     Step,
-    WristPose,
     bisect,
     bump,
     plateau,
     ramp,
 )
 from intercap_core.studio.hands import FLAT, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import Interaction, Performance, upright
+from intercap_core.studio.interactions.base import Interaction, Performance, shifted, upright
+from intercap_core.studio.interactions.grasps import backed_off
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, still
 from intercap_core.studio.skeleton import local_rotations, unit
 
@@ -124,26 +125,10 @@ class Sitting(Interaction):
         palm = unit(np.array([0.08, -0.38, -0.90]))
         rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
         place = np.array([*self.palm_at, self.seat_top + 0.10]) - rotation @ hand.knuckles.mean(0)
-        return self.approached(RIGHT, FLAT, rotation, place, np.array([0, 0, 1.0]), -self.touch_m)
-
-    def approached(
-        self,
-        side: int,
-        hand_shape: HandShape,
-        rotation: np.ndarray,
-        place: np.ndarray,
-        away: np.ndarray,
-        gap: float,
-    ) -> np.ndarray:
-        """A wrist (4, 4) moved along ``away`` from ``place`` until the hand is ``gap`` from the
-        seat (negative: pressed)."""
-
-        def is_too_near(way: float) -> bool:
-            pose = invert(self.seat) @ rigid(rotation, place + way * away)
-            return self.puppet.hands[side].gap(hand_shape, self.prop.surface, pose) < gap
-
-        _, way = bisect(-0.15, 0.12, 18, is_too_near)
-        return rigid(rotation, place + way * away)
+        return backed_off(
+            hand, FLAT, self.prop.surface, self.seat, rigid(rotation, place),
+            np.array([0, 0, 1.0]), -self.touch_m, reach_m=(-0.15, 0.12), steps=18,
+        )  # fmt: skip
 
     def trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
         """Trunk (N) of sitting down and rising; ``still`` leaves out sway and weight shift."""
@@ -173,7 +158,7 @@ class Sitting(Interaction):
         head[:, 1] -= 0.3 * feel
         return Trunk(pelvis, track[:, 3], bend, head)
 
-    def on_thigh(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> WristPose:
+    def on_thigh(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> PoseTrack:
         """The wrist over the thigh of its side, the palm down."""
         puppet, sign = self.puppet, (1.0, -1.0)[side]
         name = ("left", "right")[side]
@@ -185,13 +170,12 @@ class Sitting(Interaction):
         position = hip + 0.52 * (thigh @ bone) + (puppet.thigh_height[side] + self.palm_m) * above
         position[:, 1] += 0.012 * sign
         fingers = unit(along + np.array([0.0, -0.15 * sign, 0.0]) + 0.10 * above)
-        return WristPose(position, puppet.wrist_rotation(side, fingers, -above))
+        return PoseTrack(position, puppet.wrist_rotation(side, fingers, -above))
 
     def _wrist(
         self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, side: int
-    ) -> WristPose:
+    ) -> PoseTrack:
         """Wrist (N): hanging, at the seat's edge (right hand), on the thigh, hanging."""
-        count = len(times)
         swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         rising = ramp(times, self.rise_s + 0.10, self.risen_s + 0.05)
@@ -200,26 +184,21 @@ class Sitting(Interaction):
             return self._around_thigh(wrist, rising, LEFT)
         thigh = self.on_thigh(world, pelvis, side)
         place = self.palm_place
-        aside = place.copy()
-        aside[:3, 3] += (0.0, -0.05, 0.11)
-        wrist = idle.towards(WristPose.still(aside, count), ramp(times, 0.54, 1.00))
-        wrist = wrist.towards(WristPose.still(place, count), ramp(times, 0.86, 1.12))
-        # out of the way of the hips
-        off = aside.copy()
-        off[1, 3] -= 0.10
-        wrist = wrist.towards(WristPose.still(off, count), ramp(times, 1.12, 1.34))
+        aside = shifted(place, (0.0, -0.05, 0.11))
+        off = shifted(aside, (0.0, -0.10, 0.0))  # out of the way of the hips
+        wrist = idle.through(times, (aside, 0.54, 1.00), (place, 0.86, 1.12), (off, 1.12, 1.34))
         lifting = ramp(times, 1.36, self.on_thigh_s)
         wrist = self._around_thigh(wrist.towards(thigh, lifting), lifting, RIGHT)
         return self._around_thigh(wrist.towards(idle, rising), rising, RIGHT)
 
-    def _around_thigh(self, wrist: WristPose, share: np.ndarray, side: int) -> WristPose:
+    def _around_thigh(self, wrist: PoseTrack, share: np.ndarray, side: int) -> PoseTrack:
         """The wrist led outwards while it is on its way (``share`` (N,)) past the thigh."""
         out = self.around_m * 4 * share * (1 - share) * (1, -1)[side]
-        return WristPose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
+        return PoseTrack(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
 
     def left_wrist(
-        self, idle: WristPose, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
-    ) -> WristPose:
+        self, idle: PoseTrack, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
+    ) -> PoseTrack:
         """The left wrist (N) until the person rises."""
         return idle.towards(self.on_thigh(world, pelvis, LEFT), ramp(times, 0.50, 1.10))
 
@@ -272,18 +251,18 @@ class StoolSit(Sitting):
         fingers, palm = unit(np.array([0.15, 0.10, -1.0])), np.array([0.0, -1.0, -0.1])
         rotation = self.puppet.wrist_rotation(LEFT, fingers, palm)
         place = np.array([0.02, 0.20, self.seat_top - 0.02]) - rotation @ hand.knuckles.mean(0)
-        return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
+        return backed_off(
+            hand, RELAXED, self.prop.surface, self.seat, rigid(rotation, place),
+            np.array([0, 1.0, 0]), hover, reach_m=(-0.15, 0.12), steps=18,
+        )  # fmt: skip
 
     def left_wrist(
-        self, idle: WristPose, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
-    ) -> WristPose:
-        count = len(times)
-        place = self.hover_place
-        aside = place.copy()
-        aside[:3, 3] += (0.0, 0.07, 0.06)
-        wrist = idle.towards(WristPose.still(aside, count), ramp(times, 0.9, self.seated_s))
-        wrist = wrist.towards(WristPose.still(place, count), ramp(times, 1.38, 1.66))
-        return wrist.towards(WristPose.still(aside, count), ramp(times, 1.92, 2.15))
+        self, idle: PoseTrack, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
+    ) -> PoseTrack:
+        place, aside = self.hover_place, shifted(self.hover_place, (0.0, 0.07, 0.06))
+        return idle.through(
+            times, (aside, 0.9, self.seated_s), (place, 1.38, 1.66), (aside, 1.92, 2.15)
+        )
 
 
 class ChairSit(Sitting):

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.studio.controls import WristPose, plateau, ramp
+from intercap_core.geometry.camera.transforms import rigid, rotation_exp
+from intercap_core.studio.controls import PoseTrack, plateau, ramp
 from intercap_core.studio.hands import HandShape
 from intercap_core.studio.interactions.presenting import Checking
 from intercap_core.studio.interactions.swinging import Swinging
 from intercap_core.studio.motion import RIGHT
-from intercap_core.studio.skeleton import turn
 
 
 def along_and_about(along: np.ndarray, about: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -23,7 +22,7 @@ def along_and_about(along: np.ndarray, about: np.ndarray, axis: np.ndarray) -> n
     """
     vectors = np.zeros((len(along), 3))
     vectors[:, 2] = about
-    rotation, place = turn(vectors), np.array([*axis, 0.0])
+    rotation, place = rotation_exp(vectors), np.array([*axis, 0.0])
     result = rigid(rotation, place - rotation @ place)
     result[:, 2, 3] += along
     return result
@@ -85,11 +84,10 @@ class Regrasp(Checking):
         moved[:, :3, 3] += np.einsum("nij,nj->ni", moved[:, :3, :3], away)
         return moved
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """As in the base script, but the bottle rests until the second grasp."""
         way = super().path(world, pelvis, times)
-        still = WristPose.still(self.pick_pose, len(times))
-        return still.towards(way, ramp(times, self.rests_until_s, 1.80))
+        return PoseTrack.of(self.pick_pose).through(times, (way, self.rests_until_s, 1.80))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
         """The hand opens and closes a second time."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from intercap_core.geometry.camera.transforms import invert, rigid
-from intercap_core.studio.controls import Step, WristPose, plateau, ramp
+from intercap_core.studio.controls import PoseTrack, Step, plateau
 from intercap_core.studio.interactions.grasps import Approach, wrapped
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT, Trunk
@@ -121,34 +121,31 @@ class Swinging(HandlingScript):
         trunk.head[:, 1] += 0.35 * swing - 0.15 * reach
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> PoseTrack:
         """Poses of the object that follow from the hand's way through the keys.
 
         Keys are relative to where the right shoulder of a standing person is at rest.
         """
-        count, puppet = len(times), self.puppet
+        puppet = self.puppet
         grip = self.grips[RIGHT].object_from_wrist
         rest = puppet.subject.rest_joints
         # Joint 17 is the right shoulder, 0 the pelvis; the rest pose has x to the left and y up.
         shoulder = np.array([0.0, rest[17, 0], rest[17, 1] - rest[0, 1]])
         shoulder = pelvis * (1, 1, 0) + (0, 0, puppet.stand) + shoulder
-        wrist = WristPose.still(self.pick_pose @ grip, count)
+        wrist = PoseTrack.of(self.pick_pose @ grip)
         for key in self.keys:
             fingers, thumb = unit(np.array(key.fingers)), unit(np.array(key.thumb))
             thumb = unit(thumb - fingers * (fingers @ thumb))
             rotation = puppet.wrist_rotation(RIGHT, fingers, np.cross(thumb, fingers))
-            place = shoulder + puppet.arm * self.size * key.wrist
-            goal = WristPose(place, np.broadcast_to(rotation, (count, 3, 3)))
-            wrist = wrist.towards(goal, ramp(times, key.start, key.end))
-        at_rest = self.place_pose @ self.object_from_wrist(RIGHT, times)
-        last = WristPose.of(at_rest)
-        above = WristPose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
+            goal = PoseTrack(shoulder + puppet.arm * self.size * key.wrist, rotation)
+            wrist = wrist.through(times, (goal, key.start, key.end))
+        last = PoseTrack.of(self.place_pose @ self.object_from_wrist(RIGHT, times))
+        above = PoseTrack(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
         start, over, lower = self.lower_s
-        wrist = wrist.towards(above, ramp(times, start, over))
-        wrist = wrist.towards(last, ramp(times, lower, self.release_s - 0.03))
+        wrist = wrist.through(times, (above, start, over), (last, lower, self.release_s - 0.03))
         wrist_from_object = invert(self.object_from_wrist(RIGHT, times))
         offset = np.einsum("nij,nj->ni", wrist.rotation, wrist_from_object[:, :3, 3])
-        return WristPose(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
+        return PoseTrack(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is a little away from the body in the swing."""
