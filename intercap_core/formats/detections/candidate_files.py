@@ -7,15 +7,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import (
     CandidateFile,
-    CandidateForm,
     DetectionPreview,
+    DetectionsByImage,
     UnreadableDetections,
     parse_candidates,
     read_first,
@@ -48,15 +48,7 @@ from intercap_core.formats.detections.mask_files import (
 from intercap_core.formats.recordings.image_files import DamagedImage
 from intercap_core.inputs.files import printable
 
-
-@dataclass
-class CandidatesByImage:
-    """Candidates of one camera."""
-
-    by_image: dict[int, list[Instance]] = field(default_factory=dict)
-    """Instances by image number; an empty list if the detector found none in the image."""
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user about entries and files that were left out."""
+CandidatesByImage = DetectionsByImage[list[Instance]]
 
 
 def camera_file(folder: Path, camera: str) -> Path | None:
@@ -91,7 +83,7 @@ def holds_instances(folder: Path, camera: str, layout: str) -> bool:
         return bool(candidate_paths(folder, camera, layout))
     try:
         content = read_first(path)
-        return bool(parse_candidates(content, CandidateForm((1, 1), {}, 0.0)).entries)
+        return bool(parse_candidates(content, (1, 1), {}).entries)
     except UnreadableDetections:
         return False
 
@@ -117,17 +109,17 @@ def read_camera(
     if not candidate_paths(folder, images.name, layout):
         candidates.notes.append(f"no candidates {folder.name}/{images.name}.json")
         return candidates
-    form = CandidateForm(images.size, names, min_score)
+    parse = partial(parse_candidates, size=images.size, names=names, min_score=min_score)
     path = camera_file(folder, images.name)
     refuse_both(path, find_json_files(folder / images.name))
     if path is not None:
         try:
-            content = parse_candidates(read_json(path), form)
+            content = parse(read_json(path))
         except UnreadableDetections as error:
             candidates.notes.append(f"{short_name(path)} {error}")
         else:
             _add_file(candidates, content, images, path)
-    _add_image_files(candidates, image_files(folder, images.name), images, form)
+    _add_image_files(candidates, image_files(folder, images.name), images, parse)
     _add_masks_of_camera(candidates, folder, images, layout)
     return candidates
 
@@ -148,7 +140,10 @@ def _add_file(
 
 
 def _add_image_files(
-    candidates: CandidatesByImage, paths: Iterable[Path], images: CameraImages, form: CandidateForm
+    candidates: CandidatesByImage,
+    paths: Iterable[Path],
+    images: CameraImages,
+    parse: Callable[..., CandidateFile],
 ) -> None:
     """Read files that hold one image each, named after it."""
     by_name = {path.name: path for path in paths}
@@ -162,7 +157,7 @@ def _add_image_files(
             absent.append(name)
             continue
         try:
-            content = parse_candidates(read_json(path), form, one_image=True)
+            content = parse(read_json(path), one_image=True)
         except UnreadableDetections as error:
             broken.append(f"{short_name(path)} {error}")
             continue
@@ -276,8 +271,7 @@ def preview_candidates(
         content = read_head(path)
         if content is None:
             return preview
-        form = CandidateForm(size, names, min_score=0.0)
-        parsed = parse_candidates(content, form, one_image=whole is None)
+        parsed = parse_candidates(content, size, names, one_image=whole is None)
     except UnreadableDetections as error:
         preview.notes.append(f"{path} {error}; the camera will count as without candidates")
         return preview
@@ -286,12 +280,6 @@ def preview_candidates(
             f"{path}: {len(parsed.faults)} of its first {parsed.entries} results cannot be used "
             f"(first: {parsed.faults[0]})"
         )
-    if parsed.scaled:
-        preview.notes.append(
-            f"{path}: masks are of another resolution than the images of {size[0]}x{size[1]} and "
-            "will be scaled"
-        )
-        parsed.scaled = 0
     if parsed.shares:
         preview.recognised.append("corners are shares of the image's size")
         parsed.shares = 0

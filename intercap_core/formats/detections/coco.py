@@ -105,19 +105,19 @@ class DetectionPreview:
     """Whether any of the keypoints can be used; True for candidates."""
 
 
+@dataclass
+class DetectionsByImage(Generic[Result]):
+    """Detections of one camera."""
+
+    by_image: dict[int, Result] = field(default_factory=dict)
+    """Detections by image number; empty if the detector found none in the image."""
+    notes: list[str] = field(default_factory=list)
+    """Messages for the user about entries and files that were left out."""
+    recognised: list[str] = field(default_factory=list)
+    """Properties recognised by content: layout, numbering, unit."""
+
+
 CandidateFile = DetectionFile[Instance]
-
-
-@dataclass(frozen=True)
-class CandidateForm:
-    """Facts that are needed to read candidates of one camera."""
-
-    size: tuple[int, int]
-    """Width and height of its images."""
-    names: Mapping[int, str]
-    """Classes by number, for files that do not list them."""
-    min_score: float
-    """Results with a lower score are left out."""
 
 
 @dataclass(frozen=True)
@@ -137,19 +137,30 @@ class _FileHead:
 
 
 def parse_candidates(
-    content: Any, form: CandidateForm, *, one_image: bool = False
+    content: Any,
+    size: tuple[int, int],
+    names: Mapping[int, str],
+    *,
+    min_score: float = 0.0,
+    one_image: bool = False,
 ) -> CandidateFile:
     """The results in parsed JSON (:func:`read_json`), in order.
 
-    Results that cannot be used are left out and reported as faults. With ``one_image``, entries
-    need not state their image. Raises :class:`UnreadableDetections` if nothing can be used.
+    Results that cannot be used are left out and reported as faults. Raises
+    :class:`UnreadableDetections` if nothing can be used.
+
+    Args:
+        size: width and height of the camera's images.
+        names: classes by number, for files that do not list them.
+        min_score: results with a lower score are left out.
+        one_image: entries need not state their image.
     """
     entries = content
     images: list[ImageKey] | None = None
-    head = _FileHead(form.names, {}, None, False)
+    head = _FileHead(names, {}, None, False)
     if isinstance(content, dict):
         entries = content.get("annotations")
-        head, images = _read_file_head(content, form.names)
+        head, images = _read_file_head(content, names)
     if not isinstance(entries, list):
         raise UnreadableDetections(
             f"holds {quoted(content)}, expected a list of results, or 'annotations' with one"
@@ -164,7 +175,7 @@ def parse_candidates(
                 raise ValueError(f"expected a result, found {quoted(entry)}")
             image = image_of(entry, head.listed, one_image)
             score = _score(entry)
-            if score < form.min_score:
+            if score < min_score:
                 continue
             segmentation = _segmentation(entry)
             if not head.shares and are_polygons_shares([segmentation]):
@@ -172,16 +183,16 @@ def parse_candidates(
                     "its corners are shares of the image's size, those of other results pixels; "
                     "write pixels"
                 )
-            instance, factors = _instance(entry, score, image, head, form.size)
+            instance, factors = _instance(entry, score, image, head, size)
         except ValueError as error:
             result.add_fault(f"entry {index}", image, error)
         else:
             result.results.append((image, instance))
-            result.scaled += factors not in ((1.0, 1.0), form.size)
-            result.shares += factors == form.size
-            result.beyond += reaches_beyond(segmentation, factors, form.size)
+            result.scaled += factors not in ((1.0, 1.0), size)
+            result.shares += factors == size
+            result.beyond += reaches_beyond(segmentation, factors, size)
             if not (isinstance(segmentation, dict) and "counts" in segmentation):
-                ends = np.add(instance.box[:2], instance.box[2:]) / form.size
+                ends = np.add(instance.box[:2], instance.box[2:]) / size
                 result.extent = max(result.extent, float(ends.max()))
         result.entries += 1
     return result

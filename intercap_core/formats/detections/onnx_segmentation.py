@@ -103,20 +103,13 @@ def suppress_overlaps(corners: np.ndarray, scores: np.ndarray, classes: np.ndarr
     union of more than 0.7 with it, the default of ultralytics' predictors. Only the 3,000 best
     boxes are considered.
     """
-    order = np.argsort(-scores, kind="stable")[: 30 * MAX_INSTANCES]
-    boxes, kinds = corners[order], classes[order]
-    area = np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0), 1)
-    alive, kept = np.ones(len(order), bool), []
-    for i in range(len(order)):
-        if not alive[i]:
-            continue
-        kept.append(i)
-        low = np.maximum(boxes[i, :2], boxes[:, :2])
-        high = np.minimum(boxes[i, 2:], boxes[:, 2:])
-        common = np.prod(np.maximum(high - low, 0), 1)
-        overlap = common / np.maximum(area[i] + area - common, 1e-9)
-        alive &= (overlap <= 0.7) | (kinds != kinds[i])
-    return order[kept]
+    if not len(corners):
+        return np.zeros(0, int)
+    boxes = np.concatenate([corners[:, :2], np.maximum(corners[:, 2:] - corners[:, :2], 0)], 1)
+    kept = cv2.dnn.NMSBoxesBatched(
+        boxes.tolist(), scores.tolist(), classes.tolist(), -np.inf, 0.7, top_k=30 * MAX_INSTANCES
+    )
+    return np.asarray(kept, int).ravel()
 
 
 Key = TypeVar("Key", bound=Hashable)

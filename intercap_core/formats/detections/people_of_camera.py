@@ -14,7 +14,7 @@ import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.coco import UnreadableDetections
+from intercap_core.formats.detections.coco import DetectionsByImage, UnreadableDetections
 from intercap_core.formats.detections.image_numbers import (
     CameraImages,
     note_broken,
@@ -121,16 +121,7 @@ class KeypointCleaner:
         return notes
 
 
-@dataclass
-class PeopleByImage:
-    """People of one camera."""
-
-    by_image: dict[int, np.ndarray] = field(default_factory=dict)
-    """People (P, 135, 3) by image number; P = 0 if the detector found none in the image."""
-    notes: list[str] = field(default_factory=list)
-    """Messages for the user about people and files that were left out."""
-    recognised: list[str] = field(default_factory=list)
-    """Properties recognised by content: layout, numbering, unit."""
+PeopleByImage = DetectionsByImage[np.ndarray]  # people (P, 135, 3)
 
 
 @dataclass

@@ -67,30 +67,32 @@ class PeopleOfImages(Protocol):
 
 
 @dataclass(frozen=True)
-class _CameraTable:
-    """Datasets of one camera. Image i has the rows from ``offsets[i]`` up to ``offsets[i + 1]``."""
+class _CandidateTable:
+    """Datasets of candidates. Image i has the rows from ``offsets[i]`` up to ``offsets[i + 1]``."""
 
-    people_offsets: np.ndarray
-    people: np.ndarray
-    candidate_offsets: np.ndarray
-    labels: list[str]
-    scores: np.ndarray
-    rle_offsets: np.ndarray
-    rle: bytes
-
-
-@dataclass(frozen=True)
-class _ImageTable:
-    """Candidates of stage ``person``. Moment t of camera c is image t C + c."""
-
-    alone: bool
-    """They replace the detector's candidates."""
     offsets: np.ndarray
-    """Image i has the rows from ``offsets[i]`` up to ``offsets[i + 1]``."""
     scores: np.ndarray
-    extents: np.ndarray
     rle_offsets: np.ndarray
     rle: bytes
+    labels: list[str] | None = None
+    """Names of classes; None = unknown."""
+    extents: np.ndarray | None = None
+    """Measured sizes, metres; None = not measured."""
+
+    def candidates(self, image: int, start: int, size: tuple[int, int]) -> list[Candidate]:
+        """Candidates of an image of ``size`` (width, height), numbered from ``start``."""
+        first, last = self.offsets[image : image + 2].tolist()
+        return [
+            Candidate(
+                index=start + row - first,
+                label=UNKNOWN_LABEL if self.labels is None else self.labels[row],
+                score=float(self.scores[row]),
+                rle=self.rle[self.rle_offsets[row] : self.rle_offsets[row + 1]],
+                image_size=size,
+                extent_m=float("nan" if self.extents is None else self.extents[row]),
+            )
+            for row in range(first, last)
+        ]
 
 
 class Detections:
@@ -118,9 +120,24 @@ class Detections:
         self.keypoints_found = artefact["keypoints_found"]
         self.candidates_found = artefact["candidates_found"]
         self.notes = tuple(artefact.text("note"))
-        self._tables = [_read_camera(artefact, name) for name in self.camera_names]
+        groups = [f"cameras/{name}" for name in self.camera_names]
+        self._people = [artefact[f"{group}/people"] for group in groups]
+        self._people_offsets = [artefact[f"{group}/people_offsets"] for group in groups]
+        self._detected = [
+            _CandidateTable(
+                offsets=artefact[f"{group}/candidate_offsets"],
+                scores=artefact[f"{group}/candidate_scores"],
+                rle_offsets=artefact[f"{group}/rle_offsets"],
+                rle=artefact[f"{group}/rle"].tobytes(),
+                labels=artefact.text(f"{group}/candidate_labels"),
+            )
+            for group in groups
+        ]
         self._image_of: np.ndarray | None = None
-        self._from_images: _ImageTable | None = None
+        # Candidates of stage ``person``, whose image t C + c is moment t of camera c; whether they
+        # replace the detector's.
+        self._from_images: _CandidateTable | None = None
+        self._images_alone = False
 
     @classmethod
     def load(cls, path: Path) -> Detections:
@@ -170,16 +187,15 @@ class Detections:
             alone = bool(artefact.attributes["images_alone"])
             if not alone and "candidate_offsets" not in artefact:
                 return self
-            table = _ImageTable(
-                alone=alone,
+            table = _CandidateTable(
                 offsets=artefact["candidate_offsets"],
                 scores=artefact["candidate_scores"],
-                extents=artefact["candidate_extents"],
                 rle_offsets=artefact["candidate_rle_offsets"],
                 rle=artefact["candidate_rle"].tobytes(),
+                extents=artefact["candidate_extents"],
             )
         both = copy(self)
-        both._from_images = table
+        both._from_images, both._images_alone = table, alone
         # An image without foreground may still show the object, so it stays "not found".
         found = (np.diff(table.offsets) > 0).reshape(source.shape)
         both.candidates_found = found if alone else self.candidates_found | found
@@ -195,46 +211,16 @@ class Detections:
 
     def people(self, t: int, c: int) -> np.ndarray:
         """Keypoints (P, 135, 3) float32 of the image's people: x, y, confidence."""
-        table, image = self._tables[c], self._image(t, c)
-        if image < 0:
-            return table.people[:0]
-        return table.people[table.people_offsets[image] : table.people_offsets[image + 1]]
+        people, offsets, image = self._people[c], self._people_offsets[c], self._image(t, c)
+        return people[:0] if image < 0 else people[offsets[image] : offsets[image + 1]]
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
         """The image's segmentation candidates, in the order of the artefacts."""
-        table, added = self._tables[c], self._from_images
-        image, count = self._image(t, c), len(self.camera_names)
-        found: list[Candidate] = []
-        if image >= 0 and (added is None or not added.alone):
-            first, last = table.candidate_offsets[image : image + 2].tolist()
-            found = [self._candidate(table, c, i, i - first) for i in range(first, last)]
-        if added is not None:
-            first, last = added.offsets[t * count + c : t * count + c + 2].tolist()
-            start = len(found) - first
-            found += [self._candidate(added, c, i, start + i) for i in range(first, last)]
-        return found
-
-    def _candidate(self, table: _CameraTable | _ImageTable, c: int, row: int, at: int) -> Candidate:
-        """Candidate of camera ``c`` in a row of ``table``, at position ``at`` in its image."""
         width, height = self.image_sizes[c].tolist()
-        return Candidate(
-            index=at,
-            label=table.labels[row] if isinstance(table, _CameraTable) else UNKNOWN_LABEL,
-            score=float(table.scores[row]),
-            rle=table.rle[table.rle_offsets[row] : table.rle_offsets[row + 1]],
-            image_size=(width, height),
-            extent_m=float("nan") if isinstance(table, _CameraTable) else float(table.extents[row]),
-        )
-
-
-def _read_camera(artefact: artefacts.Artefact, name: str) -> _CameraTable:
-    group = f"cameras/{name}"
-    return _CameraTable(
-        people_offsets=artefact[f"{group}/people_offsets"],
-        people=artefact[f"{group}/people"],
-        candidate_offsets=artefact[f"{group}/candidate_offsets"],
-        labels=artefact.text(f"{group}/candidate_labels"),
-        scores=artefact[f"{group}/candidate_scores"],
-        rle_offsets=artefact[f"{group}/rle_offsets"],
-        rle=artefact[f"{group}/rle"].tobytes(),
-    )
+        image, found = self._image(t, c), list[Candidate]()
+        if image >= 0 and not self._images_alone:
+            found = self._detected[c].candidates(image, 0, (width, height))
+        if self._from_images is not None:
+            image = t * len(self.camera_names) + c
+            found += self._from_images.candidates(image, len(found), (width, height))
+        return found

@@ -11,7 +11,6 @@ import pytest
 
 from intercap_core.formats.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0
 from intercap_core.formats.detections.coco import (
-    CandidateForm,
     ImageKey,
     UnreadableDetections,
     parse_candidates,
@@ -37,9 +36,7 @@ def read(tmp_path, content, **options):
     path = tmp_path / "k1.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     names, score = options.pop("names", COCO_NAMES), options.pop("min_score", 0.05)
-    return parse_candidates(
-        read_json(path), CandidateForm((WIDTH, HEIGHT), names, score), **options
-    )
+    return parse_candidates(read_json(path), (WIDTH, HEIGHT), names, min_score=score, **options)
 
 
 def instances(found, number):
