@@ -10,7 +10,7 @@ import pytest
 
 from intercap_core.commands.calibrate import calibrate
 from intercap_core.evaluation.scene_errors import displacement
-from intercap_core.formats.calibration.files import RecordedCameras, read_poses
+from intercap_core.formats.calibration.files import read_calibration
 from tests.calibrate.plain_project import SIZE, PlainProject, small_ring, write_walk
 from tests.helpers.ros_files import PERIOD_NS, START_NS, BagFile, Form
 
@@ -46,7 +46,7 @@ def test_poses_follow_from_a_walk_in_bags(tmp_path: Path, form: Form, lenses: bo
         project.load(), "walk", output=None, lenses=None if lenses else tmp_path / "lenses.json",
         board=None, recordings=[], distance=f"k1:k2:{apart:.4f}", master=None, replace=False,
     )  # fmt: skip
-    found = read_poses(path, RecordedCameras(), None)
+    found = read_calibration(path, lenses=False)
     poses = np.stack([found.extrinsics.master_from_colour[name] for name in TRUTH.names])
     assert displacement(poses, TRUTH.master_from_colour, 0).max() < 0.02
     assert ("camera_matrix" in json.dumps(json.loads(path.read_text()))) is not lenses

@@ -21,7 +21,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.k4a import read_calibration
+from intercap_core.formats.calibration.k4a import parse_camera
 from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Camera
@@ -53,7 +53,7 @@ def claimed_camera(capture: Path, name: str) -> Camera:
     with KinectFile(capture / f"{name}.mkv") as recording:
         info = recording.info
     poses = read_extrinsics(capture / "calibration.json").master_from_colour
-    return read_calibration(
+    return parse_camera(
         info.calibration, colour_mode=info.colour_mode, depth_mode=info.depth_mode, name=name,
         source=name, master_from_colour=poses[name],
     )  # fmt: skip

@@ -15,7 +15,7 @@ from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
-    read_calibration,
+    parse_camera,
 )
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
@@ -114,7 +114,7 @@ def test_calibration_round_trip_in_every_mode(colour_mode, depth_mode):
     )
     modes = dict(colour_mode=colour_mode, depth_mode=depth_mode)
     content = write_calibration(camera, serial="000111", **modes)
-    again = read_calibration(content, name="k3", source="k3.mkv", **modes)
+    again = parse_camera(content, name="k3", source="k3.mkv", **modes)
     assert np.allclose(again.colour.parameters, camera.colour.parameters, rtol=0, atol=1e-9)
     assert np.allclose(again.depth.parameters, camera.depth.parameters, rtol=0, atol=1e-9)
     assert np.allclose(again.colour_from_depth, camera.colour_from_depth, atol=1e-12)

@@ -64,10 +64,9 @@ NUMBERS = {model.name: number for number, model in MODELS.items()}
 
 
 class _Image(NamedTuple):
-    """One image of the model: pose as in the header, number of its camera, path."""
+    """One image of the model: quaternion and translation (7 numbers), camera's number, path."""
 
-    quaternion: tuple[float, ...]
-    translation: tuple[float, ...]
+    pose: list[float]
     camera: int
     name: str
 
@@ -116,16 +115,15 @@ READER = CalibrationReader(
 
 def _pose(image: _Image, path: Path) -> np.ndarray:
     """Camera from world (4, 4), in the model's unit of length."""
-    w, x, y, z = image.quaternion
-    numbers = np.array([*image.quaternion, *image.translation])
-    if not np.isfinite(numbers).all() or abs(np.linalg.norm(image.quaternion) - 1) > 0.01:
+    quaternion, translation = np.split(np.array(image.pose), [4])
+    if not np.isfinite(image.pose).all() or abs(np.linalg.norm(quaternion) - 1) > 0.01:
         raise UserError(
             f"{path}: image {quoted(image.name)} has no unit quaternion and translation; export "
             "the model again"
         )
     from scipy.spatial.transform import Rotation  # slow import; all readers are imported
 
-    return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.translation))
+    return rigid(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), translation)
 
 
 def _lens(number: int, size: tuple[int, int], values: list[float], where: str) -> Intrinsics:
@@ -195,7 +193,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
                 f"{path}, line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; "
                 "export the model again"
             )
-        yield _Image(tuple(values[:4]), tuple(values[4:]), identity, name)
+        yield _Image(values, identity, name)
         next(lines, None)  # the line of the image's points, which may be empty
 
 
@@ -244,4 +242,4 @@ def _binary_images(content: _Bytes) -> Iterator[_Image]:
         _, *values, camera = content.take("i7di")
         name = content.name()
         content.skip(24 * content.take("Q")[0])  # points: x, y and an identity, 8 bytes each
-        yield _Image(tuple(values[:4]), tuple(values[4:]), camera, name)
+        yield _Image(values, camera, name)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import parse_pose
 from intercap_core.formats.calibration.files import (
     CalibrationReader,
     RecordedCameras,
@@ -24,7 +25,6 @@ from intercap_core.formats.calibration.opencv import (
     Calibration,
     load_opencv,
     opencv_lens,
-    opencv_pose,
     parse_image_size,
 )
 from intercap_core.inputs.files import quoted
@@ -94,7 +94,7 @@ def _pose(content: dict[str, Any], name: str, where: str) -> np.ndarray:
     rotations = [rotation for rotation in rotations if rotation is not None]
     if not rotations:
         raise UserError(f"{where}: has no R_{name}; calibrate this camera too")
-    poses = [opencv_pose(rotation, translation, where) for rotation in rotations]
+    poses = [parse_pose(rotation, translation, where) for rotation in rotations]
     if np.abs(poses[0] - poses[-1]).max() > 1e-3:  # files have six digits
         raise UserError(f"{where}: R_{name} and Rot_{name} are two rotations; keep the right one")
     return poses[0]

@@ -8,13 +8,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid, rotation_exp
 from intercap_core.inputs.documents import read_object
-from intercap_core.inputs.files import printable, quoted
+from intercap_core.inputs.files import parse_numbers, printable, quoted
 
 MAX_DISTANCE_M = 100.0  # of a camera from the file's origin; beyond it, the file is in millimetres
 MAX_TO_MASTER_M = 30.0  # a sports hall; beyond it, the file is in centimetres
@@ -103,38 +104,36 @@ def _read_release_folder(folder: Path) -> Extrinsics:
     poses = {}
     for number, path in sorted(files.items()):
         content = read_object(path)
-        try:
-            rotation, translation = (
-                np.array(content[key], np.float64).reshape(3) for key in ("R", "T")
-            )
-        except (KeyError, TypeError, ValueError, OverflowError):
-            raise UserError(
-                f"{path}: expected a rotation vector 'R' and a translation 'T' of three numbers "
-                "each; correct it"
-            ) from None
-        if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-            raise UserError(
-                f"{path}: rotation vector 'R' or translation 'T' holds no finite number; calibrate "
-                "this camera again"
-            )
-        check_distance(path, "the camera", translation)
-        camera_from_world = rigid(rotation_matrix(path, rotation), translation)
-        poses[f"k{number}"] = invert(camera_from_world)
+        pose = parse_pose(content.get("R"), content.get("T"), f"{path}")
+        check_distance(path, "the camera", pose[:3, 3])
+        poses[f"k{number}"] = invert(pose)
     return relate_to_master(folder, "k1", poses)
 
 
-def rotation_matrix(where: Path | str, vector: np.ndarray) -> np.ndarray:
-    """Return the matrix (3, 3) of a rotation vector (3,), radians.
+def parse_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
+    """Pose camera_from_world (4, 4) of x_camera = R x_world + T.
 
-    Raises UserError, beginning with ``where``, if it is longer than a whole turn.
+    Raises UserError, beginning with ``where``, for numbers that are no pose.
+
+    Args:
+        rotation: R, a 3x3 matrix or a rotation vector, radians.
+        translation: T, three numbers, metres.
+        where: file and camera.
     """
-    length = float(np.linalg.norm(vector))
-    if length > 2 * np.pi:
+    r, t = parse_numbers(rotation, where, "R"), parse_numbers(translation, where, "T").ravel()
+    if r.size == 3:
+        length = float(np.linalg.norm(r))
+        if length > 2 * np.pi:
+            raise UserError(
+                f"{where}: rotation vector R has length {length:.4g}, expected radians, at most a "
+                "whole turn (6.28); convert degrees to radians"
+            )
+        r = rotation_exp(r.ravel())
+    if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
-            f"{where}: rotation vector R has length {length:.4g}, expected radians, at most a "
-            "whole turn (6.28); convert degrees to radians"
+            f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"
         )
-    return rotation_exp(vector)
+    return rigid(r, t)
 
 
 def check_camera_name(path: Path, name: str) -> None:

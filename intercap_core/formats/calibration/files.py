@@ -80,42 +80,30 @@ def calibration_readers() -> tuple[CalibrationReader, ...]:
 
 
 def read_calibration(
-    path: Path, recorded: RecordedCameras | None = None, *, scale: float | None = None
+    path: Path,
+    recorded: RecordedCameras | None = None,
+    *,
+    scale: float | None = None,
+    lenses: bool = True,
 ) -> Calibration:
     """Read a calibration in OpenCV's terms or of another tool.
 
-    Raises UserError as the format's reader does. :mod:`.opencv` defines its files in metres, so a
-    ``scale`` for them raises UserError too.
+    Raises UserError as the format's reader does, and for a ``scale`` of a file that is in metres.
 
-    ``scale``: metres for one unit of the file, None = not stated.
+    Args:
+        path: file or folder.
+        recorded: the recordings, which help to name the cameras.
+        scale: metres for one unit of the file; None = not stated.
+        lenses: whether the file must state lenses. Otherwise rig files and the folders of
+            :func:`read_extrinsics` are read too; their ``cameras`` are empty.
     """
-    calibration = read_tool_calibration(path, recorded or RecordedCameras(), scale)
-    if calibration is not None:
-        return calibration
-    refuse_scale(path, scale)
-    return read_opencv_calibration(path)
-
-
-def read_tool_calibration(
-    path: Path, recorded: RecordedCameras, scale: float | None
-) -> Calibration | None:
-    """Read a calibration of another tool; None if no reader recognises the path."""
     if not path.is_dir() and any(path.name in reader.parts for reader in calibration_readers()):
         raise UserError(f"{path}: is a part of a calibration; name its folder, {path.parent}")
     reader = next((reader for reader in calibration_readers() if reader.recognises(path)), None)
-    return None if reader is None else reader.read(path, recorded, scale)
-
-
-def read_poses(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
-    """Read the poses of recordings that hold their lenses, and the lenses that ``path`` states.
-
-    Rig files and the folders of :func:`read_extrinsics` state none: ``cameras`` is then empty.
-    """
-    other = read_tool_calibration(path, recorded, scale)
-    if other is not None:
-        return other
+    if reader is not None:
+        return reader.read(path, recorded or RecordedCameras(), scale)
     refuse_scale(path, scale)
-    if states_lenses(path):
+    if lenses or states_lenses(path):
         return read_opencv_calibration(path)
     return Calibration({}, read_extrinsics(path))
 

@@ -110,7 +110,7 @@ def _pose_of(entry: dict[str, Any]) -> np.ndarray:
     return pose
 
 
-def read_calibration(
+def parse_camera(
     content: bytes,
     *,
     colour_mode: str,

@@ -21,8 +21,8 @@ from intercap_core.formats.calibration.extrinsics import (
     Extrinsics,
     check_distance,
     list_names,
+    parse_pose,
     relate_to_master,
-    rotation_matrix,
 )
 from intercap_core.formats.calibration.lens_checks import (
     check_lens,
@@ -31,7 +31,7 @@ from intercap_core.formats.calibration.lens_checks import (
     turning_radius,
 )
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
-from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
+from intercap_core.geometry.camera.transforms import invert, is_rigid
 from intercap_core.inputs.documents import YamlLoader, read_json, read_yaml
 from intercap_core.inputs.files import UnreadableFile, parse_numbers, quoted
 
@@ -189,22 +189,6 @@ def parse_image_size(size: Any, where: str) -> tuple[int, int]:
     return int(numbers[0]), int(numbers[1])
 
 
-def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
-    """Camera from world (4, 4) of a rotation and a translation (3,).
-
-    The rotation is a matrix (3, 3) or a rotation vector (3,).
-
-    Raises UserError, beginning with ``where``, for numbers that are no pose.
-    """
-    r, t = parse_numbers(rotation, where, "R"), parse_numbers(translation, where, "T").ravel()
-    r = rotation_matrix(where, r.ravel()) if r.size == 3 else r
-    if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
-        raise UserError(
-            f"{where}: R is no rotation (3x3, or a vector of 3) or T no vector of 3; correct it"
-        )
-    return rigid(r, t)
-
-
 def _camera(entry: dict[str, Any], where: str, fps: float | None, unit: float) -> CalibratedCamera:
     """Read all of a camera's entry but its pose.
 
@@ -274,7 +258,7 @@ def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> 
             f"{where}: has no pose; add R (3x3, or a rotation vector) and T with x_camera = R "
             "x_world + T, metres"
         )
-    camera_from_world = opencv_pose(rotation, translation, where)
+    camera_from_world = parse_pose(rotation, translation, where)
     check_distance(path, f"camera {where.rpartition(' ')[2]}", camera_from_world[:3, 3])
     return invert(camera_from_world)
 

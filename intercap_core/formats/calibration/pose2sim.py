@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import parse_pose
 from intercap_core.formats.calibration.files import (
     CalibrationReader,
     RecordedCameras,
@@ -23,7 +24,6 @@ from intercap_core.formats.calibration.files import (
 from intercap_core.formats.calibration.opencv import (
     Calibration,
     opencv_lens,
-    opencv_pose,
     parse_image_size,
 )
 from intercap_core.inputs.documents import read_toml
@@ -55,7 +55,7 @@ def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibra
             )
         size = parse_image_size(table["size"], where)
         lens = opencv_lens(size, table["matrix"], table["distortions"], where)
-        pose = opencv_pose(table["rotation"], table["translation"], where)
+        pose = parse_pose(table["rotation"], table["translation"], where)
         cameras.append(ToolCamera(_names(section, table, where), lens, pose))
     pose2sim = all("fisheye" in table for table in tables.values())
     unit = "its translations are in the unit in which the board's squares were stated"

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.extrinsics import parse_pose
 from intercap_core.formats.calibration.files import (
     CalibrationReader,
     RecordedCameras,
@@ -27,7 +28,6 @@ from intercap_core.formats.calibration.files import (
 from intercap_core.formats.calibration.opencv import (
     Calibration,
     opencv_lens,
-    opencv_pose,
     parse_image_size,
 )
 from intercap_core.inputs.files import (
@@ -103,7 +103,7 @@ def _camera(path: Path, element: ElementTree.Element) -> ToolCamera:
     axes = numbers("transform", *(f"r{row}{column}" for row in "123" for column in "123"))
     turn = np.diag([1.0, -1.0, -1.0]) @ axes.reshape(3, 3)  # to OpenCV's axes
     centre = 1e-3 * numbers("transform", "x", "y", "z")
-    pose = opencv_pose(turn, -turn @ centre, where)
+    pose = parse_pose(turn, -turn @ centre, where)
     return ToolCamera((name,), opencv_lens(size, matrix, distortion, where), pose)
 
 

@@ -18,14 +18,15 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import (
-    MAX_DISTANCE_M,
     Extrinsics,
+    check_distance,
     relate_to_master,
 )
 from intercap_core.formats.calibration.lens_checks import check_lens, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
 from intercap_core.formats.recordings.numbering import FRAME_FOLDER
 from intercap_core.formats.recordings.source import RecordingLayout
+from intercap_core.formats.recordings.timestamps import frame_rate
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
 from intercap_core.inputs.documents import read_json, read_object
@@ -72,7 +73,7 @@ class BehaveLayout(RecordingLayout):
             )
         check_lens(lens, f"intrinsics of {name}")
         pose = self.extrinsics.master_from_colour[name]
-        fps = frame_rate(list(self._frames))
+        fps = nominal_rate(list(self._frames))
         return AlignedRecording(recordings, name, lens, pose, shots=shots, fps=fps)
 
 
@@ -104,11 +105,9 @@ def _cameras_of(frames: Iterable[dict[tuple[str, str], Path]]) -> list[str]:
     return sorted({name for images in frames for name, _ in images}, key=lambda name: int(name[1:]))
 
 
-def frame_rate(times_us: list[int]) -> float:
+def nominal_rate(times_us: list[int]) -> float:
     """Nominal frame rate of increasing times; 1 for a single time."""
-    if len(times_us) < 2:
-        return 1.0
-    fps = 1e6 / float(np.median(np.diff(times_us)))
+    fps = frame_rate(np.array(times_us)) or 1.0
     # Rates of Azure Kinects. Folder names round times to milliseconds, 3 % of a period at 30 Hz.
     return next((n for n in (30.0, 15.0, 5.0) if abs(fps / n - 1) < 0.05), fps)
 
@@ -147,11 +146,7 @@ def read_poses(folder: Path) -> Extrinsics:
                 f"{file}: expected a rotation matrix 'rotation' of 9 numbers and a 'translation' "
                 "of 3, metres; get the file from the data set again"
             )
-        if np.abs(pose[:3, 3]).max() > MAX_DISTANCE_M:
-            raise UserError(
-                f"{file}: has a translation of {np.abs(pose[:3, 3]).max():.4g} m, expected at most "
-                f"{MAX_DISTANCE_M:.0f} m; write it in metres"
-            )
+        check_distance(file, "the camera", pose[:3, 3])
         world_from_colour[f"k{number}"] = pose
     if MASTER not in world_from_colour:
         raise UserError(

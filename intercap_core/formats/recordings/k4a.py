@@ -24,12 +24,12 @@ from av.stream import Discard
 
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.files import RecordedCameras, read_poses
+from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
 from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
-    read_calibration,
+    parse_camera,
 )
 from intercap_core.formats.calibration.opencv import check_rate
 from intercap_core.formats.recordings import containers, encodings
@@ -166,7 +166,7 @@ class KinectFile(ClosedOnExit):
 
         ``master_from_colour``: pose (4, 4), None = the identity.
         """
-        return read_calibration(
+        return parse_camera(
             self.info.calibration,
             colour_mode=self.info.colour_mode,
             depth_mode=self.info.depth_mode,
@@ -325,8 +325,12 @@ class KinectLayout(RecordingLayout):
                     f"and {file.name}; keep one"
                 )
         self.names = list(self._paths)
-        path, scale = sequence.calibration, sequence.calibration_scale
-        self.extrinsics = read_poses(path, RecordedCameras(self.names), scale).extrinsics
+        self.extrinsics = read_calibration(
+            sequence.calibration,
+            RecordedCameras(self.names),
+            scale=sequence.calibration_scale,
+            lenses=False,
+        ).extrinsics
 
     def open(self, name: str) -> KinectRecording:
         """Open ``<name>.mkv``; raises UserError as :class:`KinectFile` does."""

@@ -64,8 +64,8 @@ def test_wrong_rig_files_are_refused(tmp_path: Path, content: str, words: str) -
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ({"R": [0, 0, 0]}, "rotation vector 'R'"),
-        ({"R": [0, 0], "T": [0, 0, 0]}, "rotation vector 'R'"),
+        ({"R": [0, 0, 0]}, "T is None, expected finite numbers"),
+        ({"R": [0, 0], "T": [0, 0, 0]}, "R is no rotation"),
         ({"R": [0, 0, float("nan")], "T": [0, 0, 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, float("inf"), 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, 1500, 0]}, "1500 m.*millimetres"),

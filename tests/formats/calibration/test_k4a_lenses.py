@@ -14,7 +14,7 @@ from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
-    read_calibration,
+    parse_camera,
 )
 
 RADIAL = (0.01, 0.02, 0.03, 0.04, 0.05, 0.06)  # k1 to k6
@@ -50,7 +50,7 @@ def moved(translation: object) -> bytes:
 
 
 def read(content: bytes, colour_mode="1080P", depth_mode="NFOV_UNBINNED"):
-    return read_calibration(
+    return parse_camera(
         content, colour_mode=colour_mode, depth_mode=depth_mode, name="k1", source="k1.mkv"
     )
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.k4a import read_calibration
+from intercap_core.formats.calibration.k4a import parse_camera
 from intercap_core.formats.recordings.k4a import KinectFile, parse_imu_samples
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
@@ -87,7 +87,7 @@ def test_real_calibration_and_gravity(real_recording, real_calibration):
         camera = recording.camera("k1")
         samples = [parse_imu_samples(p.content) for p in recording.packets() if p.kind == "imu"]
         rotation = recording.colour_from_accelerometer()
-    other = read_calibration(
+    other = parse_camera(
         real_calibration, colour_mode="720P", depth_mode="NFOV_UNBINNED", name="k1", source="json"
     )
     assert np.array_equal(camera.colour.parameters, other.colour.parameters)

@@ -7,14 +7,16 @@ definitions alone: ``rosbags`` would compile the definitions in a file to Python
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from intercap_core.errors import MissingPackage, UserError
 from intercap_core.formats.recordings.source import ClosedOnExit
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import TopicInfo
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"  # of a bag folder of ROS 2
@@ -50,16 +52,6 @@ _ROS1_TYPES = {
 }
 
 
-class Topic(NamedTuple):
-    """One topic of a bag."""
-
-    name: str
-    type: str
-    """Type of the messages as ROS 2 writes it, such as ``sensor_msgs/msg/Image``."""
-    messages: int
-    """Number of messages."""
-
-
 class Bag(ClosedOnExit):
     """An open bag; use as a context manager.
 
@@ -68,8 +60,8 @@ class Bag(ClosedOnExit):
     """
 
     path: Path
-    topics: dict[str, Topic]
-    """Topics by name, without those that hold no message."""
+    topics: dict[str, TopicInfo]
+    """Type (as ROS 2 writes it) and number of messages by topic, without topics that hold none."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -78,14 +70,8 @@ class Bag(ClosedOnExit):
         self._store = _type_store(self._is_ros1)
         with self._explained():
             self._reader = _open_reader(path, self._is_ros1)
-            counts: Counter[tuple[str, str]] = Counter()
-            for connection in self._reader.connections:
-                counts[connection.topic, connection.msgtype] += connection.msgcount
-        self.topics = {
-            name: Topic(name, type_name, count)
-            for (name, type_name), count in counts.items()
-            if count
-        }
+            topics = self._reader.topics
+        self.topics = {name: topic for name, topic in topics.items() if topic.msgcount}
 
     def close(self) -> None:
         """Close the files."""

@@ -20,7 +20,7 @@ from intercap_core.errors import MissingPackage, UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, check_camera_name
 from intercap_core.formats.calibration.files import (
     RecordedCameras,
-    read_poses,
+    read_calibration,
     refuse_scale,
 )
 from intercap_core.formats.calibration.opencv import CalibratedCamera, check_rate
@@ -123,7 +123,8 @@ class RosLayout(RecordingLayout):
             refuse_scale(path, scale)
             self.extrinsics = self._static_poses(path)
             return
-        calibration = read_poses(path, RecordedCameras(self.names), scale)
+        recorded = RecordedCameras(self.names)
+        calibration = read_calibration(path, recorded, scale=scale, lenses=False)
         self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
 
     def _static_poses(self, path: Path) -> Extrinsics:
@@ -204,7 +205,7 @@ class RosRecording(CameraRecording):
         with contextlib.suppress(DamagedImage):
             content, remark = decode_colour(self._bag.first(topic))
             size = encoded_size(content)
-        count = self._bag.topics[topic].messages
+        count = self._bag.topics[topic].msgcount
         remarks = (f"colour images {remark}",) if remark else ()
         return RecordingPreview(size, count, (count - 1) / self.fps, remarks=remarks)
 

@@ -24,11 +24,8 @@ from intercap_core.formats.recordings.ros.streams import (
 )
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
 
-_COLOUR, _DEPTH, _ACCELEROMETER = (
-    2,
-    3,
-    4,
-)  # OBSensorType, OBFrameType and OBStreamType have the same numbers
+# OBSensorType, OBFrameType and OBStreamType have the same numbers.
+_COLOUR, _DEPTH, _ACCELEROMETER = 2, 3, 4
 # OBCameraDistortionModel: none, modified, (plain) and of six coefficients Brown-Conrady. The
 # modified model scales the tangential part too, by less than 0.05 px. Inverse and fisheye models
 # are not OpenCV's.
@@ -51,7 +48,7 @@ def read(
     device = bag.first("/cam/deviceInfo")
     serial = "" if device is None else str(device.sn)
     if _topic(_DEPTH) not in bag.topics:
-        return CameraStreams(colour, None, None, serial=serial)
+        return CameraStreams(colour, serial=serial)
     depth, profile = _stream(bag, _DEPTH)
     pose = _pose(profile)
     if not is_rigid(pose, 1e-3):
@@ -97,7 +94,6 @@ def _stream(bag: Bag, number: int) -> tuple[Stream, Any]:
 
 
 SCHEME = Scheme(
-    "Orbbec's recorder",
     lambda bag: _topic(_COLOUR) in bag.topics or _topic(_DEPTH) in bag.topics,
     lambda bag: [""],
     read,

@@ -57,7 +57,7 @@ def read(
     device = of_device[0][2]
     colour = _stream(bag, choose_topic(bag, "colour", colour_topics, preferred))
     serial = _text_of(bag, f"{device}/info").get("Serial Number", "")
-    streams = CameraStreams(colour, None, None, serial=serial)
+    streams = CameraStreams(colour, serial=serial)
     inertial = [topic for topic in bag.topics if _ACCELERATION.fullmatch(topic)]
     for topic in (topic for topic in inertial if topic.startswith(f"{device}/")):
         pose = _pose_in(bag, colour.topic, topic)
@@ -176,7 +176,6 @@ def _pairs(text: str) -> dict[str, str]:
 
 
 SCHEME = Scheme(
-    "RealSense's recorder",
     lambda bag: any(_IMAGES.fullmatch(topic) for topic in bag.topics),
     list_cameras,
     read,

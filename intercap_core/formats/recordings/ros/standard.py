@@ -9,6 +9,7 @@ from __future__ import annotations
 import posixpath
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,8 +71,11 @@ def read(
     lens, depth_lens = (known.colour, known.depth) if known else (None, None)
     colour, frame = _stream(bag, "colour", topics["colour"], preferred, lens)
     accelerometer, rotation = _accelerometer(bag, path, frame, transforms)
+    streams = CameraStreams(
+        colour, frame=frame, accelerometer=accelerometer, colour_from_accelerometer=rotation
+    )
     if not topics["depth"]:
-        return CameraStreams(colour, None, None, frame, "", 0.0, accelerometer, rotation)
+        return streams
     depth, depth_frame = _stream(bag, "depth", topics["depth"], preferred, depth_lens)
     pose = np.eye(4) if frame == depth_frame else transforms.between(frame, depth_frame)
     if depth.lens is depth_lens or pose is None:
@@ -82,7 +86,7 @@ def read(
             f"{quoted(frame)}, and no static transform connects them; record /tf_static, or depth "
             "that is aligned to colour, or state the depth of the camera in column calibration"
         )
-    return CameraStreams(colour, depth, pose, frame, "", 0.0, accelerometer, rotation)
+    return replace(streams, depth=depth, colour_from_depth=pose)
 
 
 def _accelerometer(
@@ -94,7 +98,7 @@ def _accelerometer(
     transform connects them.
     """
     for topic in sorted(bag.topics):
-        if bag.topics[topic].type == IMU and topic.startswith(f"{path}/"):
+        if bag.topics[topic].msgtype == IMU and topic.startswith(f"{path}/"):
             message = bag.first(topic)
             if acceleration(message).any():
                 pose = transforms.between(frame, message.header.frame_id)
@@ -105,15 +109,15 @@ def _accelerometer(
 def _cameras(bag: Bag) -> dict[str, list[str]]:
     """Topics with images by the path of their camera; of a stream's transports, raw images."""
     found: dict[str, dict[str, str]] = {}
-    for topic in bag.topics.values():
-        base = _TRANSPORT.sub("", topic.name)
-        if topic.type not in IMAGE_TYPES or _OTHER_STREAM.search(base):
+    for name, topic in bag.topics.items():
+        base = _TRANSPORT.sub("", name)
+        if topic.msgtype not in IMAGE_TYPES or _OTHER_STREAM.search(base):
             continue
         folder = posixpath.dirname(base)
         is_stream = _STREAM.fullmatch(posixpath.basename(folder))
         streams = found.setdefault(posixpath.dirname(folder) if is_stream else folder, {})
-        if base not in streams or topic.type == IMAGE:
-            streams[base] = topic.name
+        if base not in streams or topic.msgtype == IMAGE:
+            streams[base] = name
     return {path.rstrip("/"): sorted(streams.values()) for path, streams in found.items()}
 
 
@@ -143,4 +147,4 @@ def _stream(
     return Stream(topic, lens), frame.lstrip("/")
 
 
-SCHEME = Scheme("ROS", lambda bag: True, list_cameras, read)
+SCHEME = Scheme(lambda bag: True, list_cameras, read)

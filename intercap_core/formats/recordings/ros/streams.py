@@ -43,8 +43,8 @@ class CameraStreams:
     """One camera of a bag."""
 
     colour: Stream
-    depth: Stream | None
-    colour_from_depth: np.ndarray | None
+    depth: Stream | None = None
+    colour_from_depth: np.ndarray | None = None
     """(4, 4), metres; None without depth."""
     frame: str = ""
     """Coordinate frame of the colour images; "" = not stated."""
@@ -62,8 +62,6 @@ class CameraStreams:
 class Scheme:
     """How one recorder names its topics."""
 
-    recorder: str
-    """Name of the recorder, for messages."""
     recognises: Callable[[Bag], bool]
     """Whether a bag has such topics."""
     list_cameras: Callable[[Bag], list[str]]
