@@ -277,9 +277,9 @@ def _plain_numbers(
     keypoints of all later images. For a video, the position is ``index``.
     """
     with layout.open(name) as recording:
-        if not isinstance(recording, FilesRecording):
-            return index, ()
-        files = recording.colour_files
+        files = recording.colour_files if isinstance(recording, FilesRecording) else []
+    if not files:  # a video
+        return index, ()
     places = {time_us: place for place, (time_us, _) in reversed(list(enumerate(files)))}
     used_times = times_us[index >= 0].tolist()
     missing = [time_us for time_us in used_times if time_us not in places]

@@ -5,18 +5,21 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
 import numpy as np
 
+from intercap_core.errors import UserError
 from intercap_core.formats.recordings.encodings import DamagedImage, encoded_size
 from intercap_core.formats.recordings.source import SOUND_RATE, RecordingPreview, Sound
 from intercap_core.inputs.files import UnreadableFile, check_file
 
 # FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
+REMOVE_ROTATION = "remove the rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
 LATEST_US = 10**16  # of a device's clock, which may count from 1970; later times are damage
 # Exif orientation by the matrix [a b; c d] of a track, with x' = a x + c y and y' = b x + d y.
 # Source: ISO/IEC 14496-12, 8.3.2.
@@ -77,8 +80,7 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
             share = 1.0
             if frames and seconds is not None:
                 share = min(1.0, (round(seconds * fps) + 1) / frames)
-    with open_container(path) as container:
-        first = first_image(container, container.streams[stream_index])
+    first = first_image(path, stream_index)
     size = None if first is None else first.size
     if seconds is None:
         return RecordingPreview(size, None, None, share, counted=False)
@@ -113,21 +115,26 @@ class FirstImage(NamedTuple):
     """Whether the packet is a JPEG file of the image as shown."""
 
 
-def first_image(container: Any, stream: Any) -> FirstImage | None:
+def first_image(path: Path, stream_index: int | None = None) -> FirstImage | None:
     """Properties of the first image that decodes; None if no image does.
 
-    Raises :class:`DamagedImage` as :func:`orientation_of` does.
+    Raises UserError for a rotation by other than quarter turns. ``stream_index``: None = the first
+    video track.
     """
-    for number, packet in enumerate(demux(container, stream, lambda: None)):
-        if number > 60:  # two seconds, within which an image must decode
-            break
-        with contextlib.suppress(av.error.FFmpegError, OSError):
-            for frame in packet.decode():
-                orientation, size = orientation_of(frame), (frame.width, frame.height)
-                # Packets of interlaced videos hold two JPEG files, each with half of the rows.
-                copied = orientation == 1 and encoded_size(bytes(packet)) == size
-                copied = copied and stream.codec_context.name == "mjpeg"
-                return FirstImage(size[::-1] if orientation >= 5 else size, orientation, copied)
+    with open_container(path) as container:
+        streams = container.streams
+        stream: Any = streams.video[0] if stream_index is None else streams[stream_index]
+        for packet in islice(demux(container, stream, lambda: None), 61):  # of two seconds
+            with contextlib.suppress(av.error.FFmpegError, OSError):
+                for frame in packet.decode():
+                    try:
+                        orientation, size = orientation_of(frame), (frame.width, frame.height)
+                    except DamagedImage as error:
+                        raise UserError(f"{path}: {error}; {REMOVE_ROTATION}") from None
+                    # Packets of interlaced videos hold two JPEG files, each with half of the rows.
+                    copied = orientation == 1 and encoded_size(bytes(packet)) == size
+                    copied = copied and stream.codec_context.name == "mjpeg"
+                    return FirstImage(size[::-1] if orientation >= 5 else size, orientation, copied)
     return None
 
 

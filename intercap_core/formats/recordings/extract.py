@@ -140,7 +140,6 @@ class _Copy:
     ) -> None:
         self.recording, self.view, self.writer = recording, view, writer
         lens = recording.camera.depth if depth else None
-        self.left_out = recording.camera.depth is not None and not depth
         self.group = f"cameras/{view.name}"
         self.colour = writer.stream(f"{self.group}/colour")
         self.depth = (
@@ -250,16 +249,12 @@ class _Copy:
             view.notes.append(f"{self.damaged} damaged images left out")
         if self.other_size:
             view.notes.append(f"{self.other_size} images of another size left out")
-        if self.left_out:
-            view.notes.append("its depth is left out (frames.depth)")
-            self._use_without_depth()
-        elif self.depth is None:
-            view.notes.append("has no depth")
+        if self.depth is None:
+            is_left_out = self.recording.camera.depth is not None
+            left_out = "its depth is left out (frames.depth)"
+            view.notes.append(left_out if is_left_out else "has no depth")
         elif not self.measured:
             empty = f"depth is zero in all {len(self.depth_times)} images"
             view.notes.append(f"{empty}: used without depth" if self.depth_times else "no depth")
-            self._use_without_depth()
-
-    def _use_without_depth(self) -> None:
-        if self.view.camera is not None:
-            self.view.camera = replace(self.view.camera, depth=None, colour_from_depth=None)
+        if not self.measured and view.camera is not None:
+            view.camera = replace(view.camera, depth=None, colour_from_depth=None)

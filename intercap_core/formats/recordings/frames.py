@@ -142,13 +142,9 @@ class Frames:
     @cached_property
     def first_set_s(self) -> float:
         """Time of the first set on the recordings' own clock, seconds; NaN without images."""
-        index, skew = self._artefact["colour_index"], self._artefact["skew"].astype(float)
-        for c, name in enumerate(self.rig.names):
-            seen = np.flatnonzero(index[:, c] >= 0)
-            if len(seen):
-                t = seen[0]
-                times = self._artefact[f"cameras/{name}/colour_time"]
-                return float(times[index[t, c]]) * 1e-6 - skew[t, c] - float(self.time_s[t])
+        for name, first_s in zip(self.rig.names, self.first_image_s.tolist(), strict=True):
+            if np.isfinite(first_s):
+                return float(self._artefact[f"cameras/{name}/colour_time"][0]) * 1e-6 - first_s
         return float("nan")
 
     @cached_property

@@ -7,7 +7,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -132,7 +132,7 @@ class FilesRecording(CameraRecording):
 
     Depth images have the size of the camera's depth lens. Without a depth lens they are not read.
     ``shots``: files in order of time; ``fps``: nominal images a second. With depth, colour images
-    that state a half turn or a mirror are refused.
+    that state a half turn or a mirror are refused. :class:`.video.VideoRecording` adds a video.
     """
 
     def __init__(
@@ -154,125 +154,110 @@ class FilesRecording(CameraRecording):
         """Device time, microseconds, and path of all colour files, including damaged ones."""
         return [(shot.time_us, shot.colour) for shot in self._shots if shot.colour is not None]
 
+    @property
+    def _depth_files(self) -> list[tuple[int, Path]]:
+        """The same of depth files; [] without a depth lens."""
+        if self.camera.depth is None:
+            return []
+        return [(shot.time_us, shot.depth) for shot in self._shots if shot.depth is not None]
+
     def preview(self) -> RecordingPreview:
         """Inspect the sizes of all files, and some of the images."""
         files = self.colour_files
         size = find_size((path for _, path in files), self._decoding.orientation)
         times = [time_us for time_us, _ in files]
         seconds = (times[-1] - times[0]) * 1e-6 if times else None
-        faults, remarks = inspect_files(self._shots, self.camera.depth, self._decoding)
-        if self.camera.depth is not None:
-            remarks += list_unpaired(self._shots, self.fps)
+        faults, remarks = self._inspect_files()
+        remarks += self._list_unpaired()
         return RecordingPreview(size, len(files), seconds, 1.0, tuple(faults), tuple(remarks))
 
     def images(self) -> Iterator[Image]:
-        """Yield images in the order of the shots; damaged ones are left out and counted."""
-        return read_pairs(self, self._shots, self._decoding)
+        """Yield images in the order of the shots; damaged ones and changes are noted."""
+        damaged: list[str] = []
+        remarks: Counter[str] = Counter()
+        kinds: tuple[Literal["colour", "depth"], ...] = ("colour", "depth")
+        for time_us, *files in self._shots:
+            for kind, path in zip(kinds, files, strict=True):
+                if path is None or (kind == "depth" and self.camera.depth is None):
+                    continue
+                try:
+                    content, remark = self._read(kind, path)
+                except DamagedImage as error:
+                    damaged.append(f"{path.name} {error}")
+                    continue
+                remarks[remark] += 1
+                yield Image(kind, time_us, content)
+        self.notes += list_remarks(remarks) + self._list_unpaired()
+        if damaged:
+            self.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
 
+    def _read(self, kind: str, path: Path) -> tuple[bytes | np.ndarray, str]:
+        """Image of a file, and a remark on what was changed; raises :class:`DamagedImage`."""
+        lens = self.camera.depth
+        if kind == "colour" or lens is None:
+            return read_colour(path, self._decoding.orientation)
+        return read_depth(path, (lens.width, lens.height), self._decoding.depth_unit_m), ""
 
-def inspect_files(
-    shots: list[ImagePair], lens: Intrinsics | None, decoding: Decoding
-) -> tuple[list[str], list[str]]:
-    """Inspect a camera's image files: the sizes of all, the content of a few.
+    def _inspect_files(self) -> tuple[list[str], list[str]]:
+        """Inspect the sizes of all files and the content of a few.
 
-    ``lens`` is that of the depth camera; None = depth is not used.
-
-    Returns:
-        Faults (empty files, and damaged ones among five inspected), and remarks on the others.
-    """
-    faults = []
-    remarks: Counter[str] = Counter()
-    for kind, paths in (
-        ("colour", [shot.colour for shot in shots if shot.colour is not None]),
-        ("depth", [shot.depth for shot in shots if shot.depth is not None and lens is not None]),
-    ):
-        empty = [path for path in paths if path.stat().st_size == 0]
-        if empty:
-            faults.append(
-                f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
-            )
-        bad = []
-        chosen = sample_evenly(np.ones(len(paths), bool), 5).tolist()
-        for index in chosen:
-            try:
-                if kind == "colour":
-                    content, remark = read_colour(paths[index], decoding.orientation)
-                    remarks[remark] += 1
-                    if not holds_all_pixels(content):
+        Returns:
+            Faults (empty files, and damaged ones among five inspected), and remarks on the others.
+        """
+        faults = []
+        remarks: Counter[str] = Counter()
+        for kind, files in (("colour", self.colour_files), ("depth", self._depth_files)):
+            paths = [path for _, path in files]
+            empty = [path for path in paths if path.stat().st_size == 0]
+            if empty:
+                faults.append(
+                    f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
+                )
+            bad = []
+            chosen = sample_evenly(np.ones(len(paths), bool), 5).tolist()
+            for path in (paths[index] for index in chosen):
+                try:
+                    content, remark = self._read(kind, path)
+                    remarks[remark] += kind == "colour"
+                    if isinstance(content, bytes) and not holds_all_pixels(content):
                         raise DamagedImage("lacks a part of its pixels")
-                elif lens is not None:
-                    size = (lens.width, lens.height)
-                    read_depth(paths[index], size, decoding.depth_unit_m)
-            except DamagedImage as error:
-                if paths[index] not in empty:
-                    bad.append(f"{paths[index].name} {error}")
-        if bad:
-            faults.append(
-                f"{len(bad)} of {len(chosen)} inspected {kind} files are damaged (first: {bad[0]})"
-            )
-    inspected = sum(remarks.values())
-    return faults, [
-        f"{count} of {inspected} inspected colour images {remark}"
-        for remark, count in remarks.items()
-        if remark
-    ]
+                except DamagedImage as error:
+                    if path not in empty:
+                        bad.append(f"{path.name} {error}")
+            if bad:
+                part = f"{len(bad)} of {len(chosen)} inspected {kind} files"
+                faults.append(f"{part} are damaged (first: {bad[0]})")
+        inspected = sum(remarks.values())
+        return faults, [
+            f"{count} of {inspected} inspected colour images {remark}"
+            for remark, count in remarks.items()
+            if remark
+        ]
+
+    def _list_unpaired(self) -> list[str]:
+        """Notes on colour images without depth, and the reverse, within half a period."""
+        colour, depth = self.colour_files, self._depth_files
+        if self.camera.depth is None or not colour:  # no depth, or a video
+            return []
+        notes = []
+        for kind, images, other, partners in (
+            ("colour", colour, "depth", depth),
+            ("depth", depth, "colour", colour),
+        ):
+            taken = np.sort([time_us for time_us, _ in partners])
+            distance = distance_to(np.array([time_us for time_us, _ in images]), taken)
+            without = [images[i][1].name for i in np.flatnonzero(distance > 0.5e6 / self.fps)]
+            if without:
+                notes.append(
+                    f"no {other} image with {len(without)} of its {kind} images "
+                    f"(first: {without[0]})"
+                )
+        return notes
 
 
 def list_remarks(remarks: Counter[str]) -> list[str]:
     """Notes on colour images by the remarks of :func:`.encodings.store_colour` and their counts."""
     return [f"{count} colour images {remark}" for remark, count in remarks.items() if remark]
-
-
-def read_pairs(
-    recording: CameraRecording, shots: list[ImagePair], decoding: Decoding
-) -> Iterator[Image]:
-    """Yield the images of ``shots``; damaged ones and changes are noted at the recording."""
-    lens = recording.camera.depth
-    damaged: list[str] = []
-    remarks: Counter[str] = Counter()
-    for time_us, colour, depth in shots:
-        if colour is not None:
-            try:
-                content, remark = read_colour(colour, decoding.orientation)
-                remarks[remark] += 1
-                yield Image("colour", time_us, content)
-            except DamagedImage as error:
-                damaged.append(f"{colour.name} {error}")
-        if depth is not None and lens is not None:
-            try:
-                image = read_depth(depth, (lens.width, lens.height), decoding.depth_unit_m)
-                yield Image("depth", time_us, image)
-            except DamagedImage as error:
-                damaged.append(f"{depth.name} {error}")
-    recording.notes += list_remarks(remarks)
-    if lens is not None:
-        recording.notes += list_unpaired(shots, recording.fps)
-    if damaged:
-        recording.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
-
-
-def list_unpaired(shots: list[ImagePair], fps: float) -> list[str]:
-    """Notes on colour images without depth, and depth images without colour, within half a period.
-
-    ``fps``: nominal images a second.
-    """
-    colour = [(shot.time_us, shot.colour) for shot in shots if shot.colour is not None]
-    depth = [(shot.time_us, shot.depth) for shot in shots if shot.depth is not None]
-    notes = []
-    for kind, images, other, partners in (
-        ("colour", colour, "depth", depth),
-        ("depth", depth, "colour", colour),
-    ):
-        if not images or not colour:  # of a video
-            continue
-        taken = np.sort([time_us for time_us, _ in partners])
-        distance = distance_to(np.array([time_us for time_us, _ in images]), taken)
-        without = [images[i][1].name for i in np.flatnonzero(distance > 0.5e6 / fps)]
-        if without:
-            notes.append(
-                f"no {other} image with {len(without)} of its {kind} images (first: {without[0]})"
-            )
-    return notes
 
 
 class AlignedRecording(FilesRecording):

@@ -15,6 +15,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy import fft
+from scipy.sparse.csgraph import connected_components
 
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
@@ -137,12 +138,10 @@ def _agreeing(delays: np.ndarray, seconds: float) -> np.ndarray:
 
 def _largest_group(delays: dict[tuple[int, int], Delay], views: int) -> list[int]:
     """The largest group of cameras that delays connect; of equal ones that of the first camera."""
-    group = list(range(views))
-    for _ in range(views):  # the smallest number spreads along the pairs
-        for a, b in delays:
-            group[a] = group[b] = min(group[a], group[b])
-    most = max(group, key=lambda g: (group.count(g), -g))
-    return [c for c in range(views) if group[c] == most]
+    shared = np.zeros((views, views), bool)
+    shared[tuple(zip(*delays, strict=True))] = True
+    group = connected_components(shared, directed=False)[1]  # numbered from the first camera on
+    return np.flatnonzero(group == np.bincount(group).argmax()).tolist()
 
 
 def _solved(delays: dict[tuple[int, int], Delay], group: list[int]) -> dict[int, float]:

@@ -18,6 +18,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.opencv import MAX_SIDE, check_rate
 from intercap_core.formats.recordings.containers import (
     LATEST_US,
+    REMOVE_ROTATION,
     demux,
     first_image,
     open_container,
@@ -35,12 +36,10 @@ from intercap_core.formats.recordings.encodings import (
 from intercap_core.formats.recordings.image_files import (
     DEFAULT,
     Decoding,
-    inspect_files,
+    FilesRecording,
     list_remarks,
-    read_pairs,
 )
 from intercap_core.formats.recordings.source import (
-    CameraRecording,
     Image,
     RecordingPreview,
     Sound,
@@ -49,8 +48,6 @@ from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import UnreadableFile
 
-_REMOVE_ROTATION = "remove the rotation (ffmpeg -display_rotation 0 -i FILE -c copy NEW)"
-
 
 def read_video_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a video's images as shown; None if none can be decoded.
@@ -58,20 +55,13 @@ def read_video_size(path: Path) -> tuple[int, int] | None:
     Raises UserError for a rotation by other than quarter turns.
     """
     try:
-        with open_container(path) as container:
-            first = first_image(container, container.streams.video[0])
-            return None if first is None else first.size
-    except DamagedImage as error:
-        raise _impossible_rotation(path, error) from None
+        first = first_image(path)
+        return None if first is None else first.size
     except (UnreadableFile, av.error.FFmpegError, OSError, IndexError):
         return None
 
 
-def _impossible_rotation(path: Path, error: DamagedImage) -> UserError:
-    return UserError(f"{path}: {error}; {_REMOVE_ROTATION}")
-
-
-class VideoRecording(CameraRecording):
+class VideoRecording(FilesRecording):
     """One video file, with or without a folder of depth files.
 
     Raises UserError, naming the file, if it is no video.
@@ -109,29 +99,18 @@ class VideoRecording(CameraRecording):
             ) from error
         try:
             self._stream, rate = self._choose_stream(path, fps)
-            with open_container(path) as other:
-                first = first_image(other, other.streams[self._stream.index])
+            first = first_image(path, self._stream.index)
             orientation = 1 if first is None else first.orientation
             if depth and orientation in (2, 3, 4):
                 raise UserError(
                     f"{path}: states a half turn or a mirror (orientation {orientation}), which "
                     "its depth files would not follow; turn the video itself, or "
-                    f"{_REMOVE_ROTATION}"
+                    f"{REMOVE_ROTATION}"
                 )
-        except DamagedImage as error:
-            self._container.close()
-            raise _impossible_rotation(path, error) from None
         except UserError:
             self._container.close()
             raise
-        super().__init__(path, camera, fps=rate)
-        self._copied = first is not None and first.copied
-        self._decoding = decoding
-        self._remarks: Counter[str] = Counter()
-        self._offset_s = offset_s
-        self._times = None if times is None else list(times.values())
-        self.timing = "" if times is None else "by timestamps"
-        self._shots, _, self.notes = pair_images(
+        shots, _, notes = pair_images(
             [],
             depth,
             fps=rate,
@@ -140,6 +119,13 @@ class VideoRecording(CameraRecording):
             source=path.with_suffix(""),
             images=int(self._stream.frames),
         )
+        super().__init__(path, camera, shots, rate, decoding)
+        self.notes += notes
+        self._copied = first is not None and first.copied
+        self._remarks: Counter[str] = Counter()
+        self._offset_s = offset_s
+        self._times = None if times is None else list(times.values())
+        self.timing = "" if times is None else "by timestamps"
         if orientation != 1:
             mirrored = ", and mirrored, which OpenCV does not do" * (orientation in (2, 4, 5, 7))
             self.notes.append(
@@ -175,7 +161,7 @@ class VideoRecording(CameraRecording):
     def preview(self) -> RecordingPreview:
         """Inspect the head, the first image, the length as :func:`preview_video`, depth files."""
         seen = preview_video(self.source, self._stream.index, self.fps)
-        faults, _ = inspect_files(self._shots, self.camera.depth, self._decoding)
+        faults, _ = self._inspect_files()
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
             if abs(stated - seen.images) > max(1, 0.02 * stated):  # images may be estimated
@@ -215,7 +201,7 @@ class VideoRecording(CameraRecording):
             self.notes.append(f"{self._damaged} damaged packets left out")
         if self.truncated:
             self.notes.append(f"the file is cut off: {count} images could be read")
-        yield from read_pairs(self, self._shots, self._decoding)
+        yield from super().images()
 
     def sound(self) -> Sound | None:
         """The file's first sound track."""
