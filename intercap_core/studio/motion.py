@@ -80,6 +80,20 @@ class Trunk:
     """(N, 3) rotation vectors of the head relative to the heading."""
 
 
+@dataclass(frozen=True)
+class PersonState:
+    """A person at N moments, stage frame, metres."""
+
+    body: np.ndarray
+    """(N, V, 3) skin."""
+    clothed: np.ndarray
+    """(N, V, 3) surface of the clothes."""
+    joints: np.ndarray
+    """(N, 55, 3)."""
+    pelvis: np.ndarray
+    """(N, 3, 3) stage_from_rest rotation of the pelvis."""
+
+
 def _sole_depth(subject: Subject, side: int) -> float:
     """Height of the ankle (joint 7 or 8) above the sole of a level foot in its shoe, metres."""
     share = np.asarray(subject.weights[:, [7 + side, 10 + side]].sum(1)).ravel()

@@ -12,7 +12,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.studio.controls import Footwork, Step, Wander
-from intercap_core.studio.motion import Puppet, Trunk
+from intercap_core.studio.motion import PersonState, Puppet, Trunk
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.skeleton import about_z
@@ -22,19 +22,11 @@ CELL_M = 0.05  # grid of the floor plan
 
 
 @dataclass(frozen=True)
-class Passing:
-    """State of the second person at N moments, stage frame, metres."""
+class Passing(PersonState):
+    """State of the second person at N moments."""
 
     present: np.ndarray
     """(N,) bool: the person is inside the room; other values are 0 if not."""
-    body: np.ndarray
-    """(N, V, 3) skin."""
-    clothed: np.ndarray
-    """(N, V, 3) surface of the clothes."""
-    joints: np.ndarray
-    """(N, 55, 3)."""
-    pelvis: np.ndarray
-    """(N, 3, 3) stage_from_rest."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +157,7 @@ class PasserBy:
             posed = self.puppet.skin(world, root)
             body[present], clothed[present] = posed.vertices, posed.clothed
             joints[present], pelvis[present] = posed.joints, world[:, 0]
-        return Passing(present, body, clothed, joints, pelvis)
+        return Passing(body, clothed, joints, pelvis, present)
 
     def _pose(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joint rotations (N, 55, 3, 3) and pelvis (N, 3) in the stage."""

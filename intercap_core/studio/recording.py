@@ -20,6 +20,7 @@ from intercap_core.studio.capture_folder import CaptureFolder, Device, DeviceFra
 from intercap_core.studio.keypoints import Detector, to_json
 from intercap_core.studio.masks import CameraMasks, Labels, MaskSimulator
 from intercap_core.studio.mediapipe import detect_keypoints
+from intercap_core.studio.motion import PersonState
 from intercap_core.studio.passer_by import Passing
 from intercap_core.studio.render import (
     BODY,
@@ -251,7 +252,7 @@ class Kinect:
     def _detected(
         self,
         detector: Detector,
-        moment: StageState | Passing,
+        moment: PersonState,
         points: np.ndarray,
         hidden: np.ndarray,
         *who: str,

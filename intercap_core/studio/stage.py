@@ -22,10 +22,10 @@ from intercap_core.studio.capture_folder import SWAPPED
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.mkv import KINECT_RATES
-from intercap_core.studio.motion import Puppet
+from intercap_core.studio.motion import PersonState, Puppet
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import TrueObject, object_colours, press_out, true_mesh
-from intercap_core.studio.passer_by import PasserBy, Passing
+from intercap_core.studio.passer_by import PasserBy
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, build_room
 from intercap_core.studio.skeleton import about_z
@@ -38,19 +38,11 @@ ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 
 @dataclass(frozen=True)
-class StageState:
-    """State at N moments in the stage frame, metres."""
+class StageState(PersonState):
+    """State of subject and object at N moments."""
 
-    body: np.ndarray
-    """(N, V, 3) skin."""
-    clothed: np.ndarray
-    """(N, V, 3) surface of the clothes."""
-    joints: np.ndarray
-    """(N, 55, 3)."""
     tips: np.ndarray
     """(N, 10, 3) fingertips, thumb to little finger, left then right."""
-    pelvis: np.ndarray
-    """(N, 3, 3) stage_from_rest rotation of the pelvis."""
     stage_from_object: np.ndarray
     """(N, 4, 4) object poses; NaN without an object."""
 
@@ -175,11 +167,10 @@ class StudioStage:
                 )
         order = [4, 0, 1, 3, 2]  # thumb, index, middle, ring, little finger
         tips = posed.tips[:, [*order, *(5 + i for i in order)]]
-        return StageState(
-            body, clothed, posed.joints, tips, world[:, JOINT_INDEX["pelvis"]], stage_from_object
-        )
+        pelvis = world[:, JOINT_INDEX["pelvis"]]
+        return StageState(body, clothed, posed.joints, pelvis, tips, stage_from_object)
 
-    def keypoints(self, moment: StageState | Passing) -> np.ndarray:
+    def keypoints(self, moment: PersonState) -> np.ndarray:
         """True keypoints (N, 135, 3) in the stage. All people have the same mesh topology."""
         chart = self.fitted.keypoint_map
         corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]

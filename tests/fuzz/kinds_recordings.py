@@ -15,7 +15,7 @@ from intercap_core.config import DetectionsSettings
 from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
 from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
 from intercap_core.formats.calibration.k4a import colour_from_accelerometer
-from intercap_core.formats.calibration.k4a import read_calibration as read_kinect
+from intercap_core.formats.calibration.k4a import parse_camera as read_kinect
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.class_names import COCO_NAMES, read_label_map
 from intercap_core.formats.detections.image_numbers import CameraImages

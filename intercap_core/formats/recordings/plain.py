@@ -168,16 +168,14 @@ class _CameraFolder:
             path,
         ]
         depth_folders = [entry for entry in below if entry.name.lower() == DEPTH_FOLDER]
-        used: list[list[Path]] = []  # files of colour, and of depth
-        unused: list[Path] = []
-        for folders, suffixes in (
-            (colour_folders, IMAGE_SUFFIXES),
-            (depth_folders, DEPTH_SUFFIXES),
-        ):
-            holding = {entry: files for entry in folders if (files := _images(entry, suffixes))}
-            used.append(next(iter(holding.values()), []))
-            unused += list(holding)[1:]
-        return cls(path, used[0], used[1], unused)
+        colour = {
+            entry: files for entry in colour_folders if (files := _images(entry, IMAGE_SUFFIXES))
+        }
+        depth = {
+            entry: files for entry in depth_folders if (files := _images(entry, DEPTH_SUFFIXES))
+        }
+        colour_files, depth_files = (next(iter(found.values()), []) for found in (colour, depth))
+        return cls(path, colour_files, depth_files, [*list(colour)[1:], *list(depth)[1:]])
 
     def notes(self, known: CalibratedCamera) -> list[str]:
         """Notes on files that are not read."""

@@ -44,13 +44,12 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
     largest group that shares sounds.
     """
     views = len(sounds)
-    delays: dict[tuple[int, int], Delay] = {}
-    for a, b in combinations(range(views), 2):
-        first, second = sounds[a], sounds[b]
-        if first is not None and second is not None:
-            delay = estimate_delay(first, second)
-            if delay is not None:
-                delays[a, b] = delay
+    heard = [(c, sound) for c, sound in enumerate(sounds) if sound is not None]
+    delays = {
+        (a, b): delay
+        for (a, first), (b, second) in combinations(heard, 2)
+        if (delay := estimate_delay(first, second)) is not None
+    }
     start, sigma = np.full(views, np.nan), np.full(views, np.nan)
     while delays:
         group = _largest_group(delays, views)

@@ -45,9 +45,8 @@ class Checking(HandlingScript):
         self.grasp()
         if self.second_hand:
             # the object's bottom on the left palm, fingers ahead and to the right
-            fingers, palm = np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0])
-            below = Approach(self.pick_pose[:3, 3], fingers, palm)
-            pose = self.pick_pose
+            pose, fingers = self.pick_pose, np.array([0.75, -0.65, -0.05])
+            below = Approach(pose[:3, 3], fingers, np.array([0, 0, 1.0]))
             self.grips[LEFT] = laid_on(self.puppet, LEFT, self.prop.surface, pose, below)
             self.hold_s[LEFT] = (self.join_s, self.part_s)
             self.haste[LEFT] = 0.6
