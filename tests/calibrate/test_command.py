@@ -27,7 +27,7 @@ from tests.helpers.synthetic_people import seen_by, stick_person, walker
 
 BOARD = "charuco:5x4:0.2:0.15:4X4_50"
 TRUTH, UP = small_ring()
-NEAR = Rig(small_ring(6)[0].cameras[:3])
+NEAR = Rig(small_ring(6)[0].cameras[:2])
 
 
 def run(project: PlainProject, **options: Any) -> tuple[Path, Path]:
@@ -57,9 +57,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> PlainProject:
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> PlainProject:
-    """A board before three neighbours of a ring of six, which see it at the same time."""
+    """A board before two neighbours of a ring of six, which see it at the same time."""
     folder = tmp_path_factory.mktemp("board")
-    write_board_recording(folder / "recordings", NEAR, parse_board(BOARD), sets=60, fps=2, seed=3)
+    write_board_recording(folder / "recordings", NEAR, parse_board(BOARD), sets=40, fps=2, seed=3)
     (folder / "lenses.json").write_text(json.dumps(lenses_of(NEAR) | {"fps": 2}))
     return PlainProject(folder).write(keypoints=False)
 
@@ -232,8 +232,7 @@ def test_other_recordings_must_have_the_same_cameras(walk: PlainProject, tmp_pat
 def test_a_board_seen_by_one_camera_only_is_refused(board: PlainProject, tmp_path: Path) -> None:
     project = PlainProject(tmp_path).write(keypoints=False)
     shutil.copytree(board.recordings, project.recordings)
-    for name in ("k2", "k3"):
-        grey = next((board.recordings / name).glob("*.jpg"))
-        for path in (project.recordings / name).glob("*.jpg"):
-            shutil.copy(grey, path)
+    grey = next((board.recordings / "k2").glob("*.jpg"))
+    for path in (project.recordings / "k2").glob("*.jpg"):
+        shutil.copy(grey, path)
     refuse(project, "k1", lenses=board.folder / "lenses.json", board=BOARD)
