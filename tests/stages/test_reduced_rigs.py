@@ -264,8 +264,9 @@ def test_later_stages_work_with_any_amount_of_depth(tmp_path, reduction):
         assert (found["truth/joint/body_pve"] < 0.02).all()
     inputs = SequencePaths(metrics=measured, **{s: paths[s] for s in STAGES["metrics"].reads})
     export.run(
-        paths=inputs, models=capture.models, output=tmp_path / "export", settings=ExportSettings()
-    )
+        paths=inputs, models=capture.models, output=tmp_path / "export",
+        settings=ExportSettings(formats=("bop", "coco")),  # those with images
+    )  # fmt: skip
     summary.run(paths=inputs, sequence=row("cap"), output=tmp_path / "summary.h5")
     page.run(
         paths=inputs, models=capture.models, sequence=row("cap"), contact=None, truth=None,
