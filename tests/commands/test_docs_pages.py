@@ -43,9 +43,11 @@ def test_the_readme_lists_every_format_and_its_library() -> None:
     }  # fmt: skip
     for name in export_formats():
         assert f"`{name}`" in texts["written"]
-    read = [*(f"`{name}" for name in INPUTS), *(scheme.recorder for scheme in SCHEMES)]
+    read = [*(f"`{name}" for name in INPUTS), "ROS:"]
     read += [reader.tool for reader in (*calibration_readers(), *keypoint_readers())]
     assert [name for name in read if name not in texts["read"]] == []
+    recorders = {scheme.read.__module__.rpartition(".")[2] for scheme in SCHEMES} - {"standard"}
+    assert len(recorders) == 2 and all(name in texts["read"].lower() for name in recorders)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     stated = [*project["dependencies"], *project["optional-dependencies"]["test"]]
     ranges = {r.name.lower(): r.specifier for r in map(Requirement, stated)}

@@ -15,7 +15,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy import fft
-from scipy.sparse.csgraph import connected_components
 
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
@@ -137,8 +136,11 @@ def _agreeing(delays: np.ndarray, seconds: float) -> np.ndarray:
 
 def _largest_group(delays: dict[tuple[int, int], Delay], views: int) -> list[int]:
     """The largest group of cameras that delays connect; of equal ones that of the first camera."""
+    from scipy.sparse.csgraph import connected_components  # slow import, for recordings with sound
+
     shared = np.zeros((views, views), bool)
-    shared[tuple(zip(*delays, strict=True))] = True
+    for pair in delays:
+        shared[pair] = True
     group = connected_components(shared, directed=False)[1]  # numbered from the first camera on
     return np.flatnonzero(group == np.bincount(group).argmax()).tolist()
 
