@@ -40,8 +40,8 @@ READ = ("frames", "detections", "scene", "person")
 ROUNDS = 2  # of tracking and fusion; the second one tracks with a mesh of all frame sets
 TRACKED_VOXELS, TRACKED_FACES = 100**3, 1500  # of the grid and of the mesh that is tracked
 MIN_TRACKED = 10  # frame sets with a pose
-# Largest standard deviation of a registered pose that the tracker takes as known: depth is averaged
-# over 1 cm, and poses of the tracker are off by 3 mm
+# Largest standard deviation of a registered pose that the tracker takes as known. Poses of the
+# tracker are off by 3 mm.
 SURE_M = 0.004
 MAX_CLOSED = 0.25  # largest share of the surface that no depth image measured
 MIN_EXPLAINED = 0.9  # least share of the object's points on the mesh

@@ -127,7 +127,8 @@ def _labelled(
     local = apply(depth_from_object, box)
     if local[:, 2].min() < NEAREST_M:
         return None
-    mixed = floating((1e3 * depth).astype(np.uint16))  # may pass beside a rod that it shows
+    # Pixels at depth edges mix two surfaces: their rays may hit a rod, and do not show empty space.
+    mixed = floating((1e3 * depth).astype(np.uint16))
     kind = np.where((depth > 0) & ~mixed, OTHER, UNKNOWN).astype(np.uint8)
     weight = np.ones(depth.shape, np.float32)
     if view is not None:

@@ -72,8 +72,9 @@ def align_together(
         clouds: points, each in a frame of its own.
         samples: some points of each cloud, which are compared with the other clouds.
         poses: (K, 4, 4) world_from_cloud with drift.
-        reach_m: distance of corresponding points in the first round and in the last one.
-        view_deg, view_m: largest difference of the poses of two clouds with a common view.
+        reach_m: largest distance of corresponding points in the first and last round, metres.
+        view_deg: largest angle between the poses of two clouds with a common view, degrees.
+        view_m: largest distance between them, metres.
     """
     count = len(clouds)
     pairs = [
@@ -121,6 +122,9 @@ def register_turned(
         clouds: points that show the object by frame set, master frame.
         seed: frame set whose pose is kept as :func:`.track_from` defines it.
         cell_m: cell of the points, metres.
+
+    Returns:
+        Registrations by frame set, with the standard deviations of :func:`.track_from`.
     """
     tracked = track_from(clouds, seed, cell_m)
     sets = sorted(tracked)

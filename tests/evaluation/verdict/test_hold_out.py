@@ -147,7 +147,7 @@ def test_a_window_of_the_inputs_has_the_data_of_its_frames(capture: fitted.Captu
 
 
 def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: HeldOut) -> None:
-    """Against Gauss-Newton steps with correspondences taken anew."""
+    """Compare with Gauss-Newton steps that search the correspondences again."""
     with _opened(capture) as (inputs, settings, result):
         assembly = assemble(inputs, settings)
         assembly.contact.take_contact(result.probability, result.annotated)
