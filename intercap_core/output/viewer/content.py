@@ -26,6 +26,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.output.export.motion import z_up_frame
 from intercap_core.output.viewer.skinning import skinned
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
@@ -43,11 +44,10 @@ class Content:
     header: dict[str, Any] = field(default_factory=dict)
     """Values that are serialized as JSON."""
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    """Arrays by name."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Body:
+class Fit:
     """Body and object of one result over T frames, master frame."""
 
     model: BodyModel
@@ -72,13 +72,13 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         bias = scene["depth_bias"]
         upright = z_up_frame(scene)
         floor = bool(scene.attributes["ground_found"])
-    bodies: dict[str, _Body] = {}
+    bodies: dict[str, Fit] = {}
     flags = Flags.of(0, ())
     imported = False
     if "joint" in existing:
         with artefacts.read(existing["joint"], JOINT) as joint:
             model = load_model(body_models, gender, joint)
-            bodies["joint"] = _Body(
+            bodies["joint"] = Fit(
                 model, read_parameters(joint), joint["rotation"], joint["translation"]
             )
             rig, bias = rig.moved(joint["master_from_colour"]), joint["depth_bias"]
@@ -106,7 +106,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             _add_poses(content, name, body.rotation, body.translation, zup)
     with Frames.open(paths.frames) as recorded:
         images = recorded.showing(image_of)
-        moments = _spread(total, 40)  # the frames that have clouds and images
+        moments = sample_evenly(np.ones(total, bool), 40)  # the frames that have clouds and images
         content.header |= {
             "name": images.sequence,
             "fps": images.fps,
@@ -139,7 +139,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
 
 def _sequential(
     body_fit: Path, existing: Mapping[str, Path], body_models: BodyModels, gender: str
-) -> _Body:
+) -> Fit:
     """Read the sequential fits; the object has no pose without an object track."""
     with artefacts.read(body_fit, BODY_FIT) as fit:
         model, parameters = load_model(body_models, gender, fit), read_parameters(fit)
@@ -148,7 +148,7 @@ def _sequential(
     if "object_track" in existing:
         with artefacts.read(existing["object_track"], OBJECT_TRACK) as track:
             rotation, translation = track["rotation"], track["translation"]
-    return _Body(model, parameters, rotation, translation)
+    return Fit(model, parameters, rotation, translation)
 
 
 def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> None:
@@ -197,7 +197,7 @@ def _simplified(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.asarray(small.vertices), np.asarray(small.triangles), colours
 
 
-def _add_body(content: Content, name: str, body: _Body, zup: np.ndarray) -> None:
+def _add_body(content: Content, name: str, body: Fit, zup: np.ndarray) -> None:
     """Add a skinned body, with its transforms in the z-up frame, quantised for the viewer."""
     skin = skinned(body.model, body.parameters)
     transforms = np.einsum("ab,tjbc->tjac", zup[:3, :3], skin.transforms)
@@ -224,21 +224,17 @@ def _add_poses(
 
 def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
     """Add pose, focal lengths, centre and size of each camera with a known pose."""
-    cameras = []
-    for camera in rig:
-        pose = zup @ camera.master_from_colour
-        lens = camera.colour
-        if np.isfinite(pose).all():
-            cameras.append(
-                {
-                    "name": camera.name,
-                    "pose": pose[:3].round(6).tolist(),
-                    "focal": [lens.fx, lens.fy],
-                    "centre": [lens.cx, lens.cy],
-                    "size": [lens.width, lens.height],
-                }
-            )
-    content.header["cameras"] = cameras
+    content.header["cameras"] = [
+        {
+            "name": camera.name,
+            "pose": (zup @ camera.master_from_colour)[:3].round(6).tolist(),
+            "focal": [camera.colour.fx, camera.colour.fy],
+            "centre": [camera.colour.cx, camera.colour.cy],
+            "size": [camera.colour.width, camera.colour.height],
+        }
+        for camera in rig
+        if np.isfinite(camera.master_from_colour).all()
+    ]
 
 
 def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray) -> None:
@@ -246,13 +242,11 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
 
     They are ordered by frame, then by camera.
     """
-    data, starts = [], [0]
-    names = [camera["name"] for camera in content.header["cameras"]]
+    packets = []
+    shown = [c for c, camera in enumerate(rig) if np.isfinite(camera.master_from_colour).all()]
     for t in moments:
-        for c, camera in enumerate(rig):
-            if camera.name not in names:
-                continue
-            packet = b""
+        for c in shown:
+            camera, packet = rig[c], b""
             lens = camera.colour.scaled(min(1.0, IMAGE_WIDTH / camera.colour.width))
             factors: tuple[Literal[1, 2, 4], ...] = (4, 2, 1)  # by which the decoder can reduce
             factor = next(f for f in factors if camera.colour.width >= f * lens.width)
@@ -265,16 +259,16 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
                 small = cv2.undistort(small, lens.matrix, lens.distortion)
                 options = [cv2.IMWRITE_WEBP_QUALITY, 60]
                 packet = cv2.imencode(".webp", small, options)[1].tobytes()
-            data.append(packet)
-            starts.append(starts[-1] + len(packet))
-    content.arrays["images/data"] = np.frombuffer(b"".join(data), np.uint8)
-    content.arrays["images/starts"] = np.array(starts, np.uint32)
+            packets.append(packet)
+    starts = np.cumsum([0, *map(len, packets)]).astype(np.uint32)
+    content.arrays["images/data"] = np.frombuffer(b"".join(packets), np.uint8)
+    content.arrays["images/starts"] = starts
 
 
 def _add_clouds(
     content: Content,
     clouds: SegmentedClouds,
-    shown: _Body,
+    shown: Fit,
     mesh: ObjectMesh | None,
     moments: np.ndarray,
     zup: np.ndarray,
@@ -299,16 +293,15 @@ def _add_clouds(
             part.append(apply(zup, kept.astype(np.float64)))
     for name, part in zip(("person", "object"), parts, strict=True):
         steps, low, step = quantised(np.concatenate(part))
-        ends = np.cumsum([len(points) for points in part], dtype=np.uint32)
         content.arrays[f"clouds/{name}"] = steps
-        content.arrays[f"clouds/{name}_starts"] = np.r_[np.uint32(0), ends].astype(np.uint32)
+        content.arrays[f"clouds/{name}_starts"] = np.cumsum([0, *map(len, part)]).astype(np.uint32)
         content.header.setdefault("clouds", {})[name] = {"low": low, "step": step}
 
 
 def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
     """Add the true body in at most 60 frames, and the true object in all frames."""
     if true.vertices is not None:
-        chosen = _spread(len(true.vertices), 60)
+        chosen = sample_evenly(np.ones(len(true.vertices), bool), 60)
         vertices = apply(zup, true.vertices[chosen].reshape(-1, 3).astype(np.float64))
         steps, low, step = quantised(vertices.reshape(len(chosen), -1, 3))
         # differences between frames compress to half the size of positions; they may wrap around
@@ -320,11 +313,6 @@ def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
         content.arrays["truth/object_vertices"] = true.object_vertices.astype(np.float32)
         content.arrays["truth/object_faces"] = true.object_faces.astype(np.uint32)
         _add_poses(content, "truth", true.rotation, true.translation, zup)
-
-
-def _spread(total: int, most: int) -> np.ndarray:
-    """Choose at most ``most`` evenly spread frames of ``total``."""
-    return np.unique(np.linspace(0, total - 1, min(total, most)).round().astype(int))
 
 
 def quantised(points: np.ndarray) -> tuple[np.ndarray, list[float], float]:

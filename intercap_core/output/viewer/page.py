@@ -29,7 +29,6 @@ POLICY = (
 
 
 def style() -> str:
-    """Return the viewer's style sheet."""
     return (DATA / "viewer.css").read_text(encoding="utf-8")
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
-from intercap_core.body.joints import PARENTS
+from intercap_core.body.kinematics import pose_joints, rotation_from_axis_angle
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.output.export.motion import posed_batches, rest_pose
 
 CLOSE_M = 0.001  # largest distance of a vertex from the model's
@@ -47,11 +47,6 @@ class SkinnedBody:
     error_m: float
     """Largest distance of a vertex from the model's, over all frames."""
 
-    def posed(self, t: int) -> np.ndarray:
-        """Return the vertices (V, 3) of frame ``t``, as the viewer computes them."""
-        shaped = self.rest + np.tensordot(self.amounts[t], self.modes, 1)
-        return _skin(shaped, self.transforms[t], self.joints, self.weights)
-
 
 def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     """Compress T posed bodies in the frame of the parameters."""
@@ -61,13 +56,16 @@ def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     weights = np.take_along_axis(all_weights, strongest, 1)
     weights /= weights.sum(1, keepdims=True)
     count = parameters.batch
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _MODE_FRAMES)).round().astype(int))
+    chosen = sample_evenly(np.ones(count, bool), _MODE_FRAMES)
     transforms = np.empty((count, len(rest_joints), 3, 4))
 
     def residuals(frames: np.ndarray) -> Iterator[np.ndarray]:
         """Set the transforms of ``frames``; yield residuals (b, V, 3) in the rest pose."""
         some = parameters.frames(torch.from_numpy(frames))
-        turns, first = _global_rotations(some.full_pose().numpy()), 0
+        local = rotation_from_axis_angle(some.full_pose().double())
+        rest_of_all = torch.from_numpy(rest_joints).expand(len(local), -1, -1)
+        turns = pose_joints(rest_of_all, local, torch.zeros(len(local), 3)).rotations.numpy()
+        first = 0
         for posed in posed_batches(model, some):
             at = slice(first, first := first + len(posed.joints))
             shifts = posed.joints.double().numpy()
@@ -97,33 +95,11 @@ def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     return SkinnedBody(rest + constant, strongest, weights, transforms, modes, amounts, error)
 
 
-def _global_rotations(pose: np.ndarray) -> np.ndarray:
-    """Compose rotation vectors (T, 55, 3) relative to the parents to rotations (T, 55, 3, 3)."""
-    local = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix().reshape(*pose.shape, 3)
-    turns = local.copy()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            turns[:, joint] = turns[:, parent] @ local[:, joint]
-    return turns
-
-
-def _blended(transforms: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blend the joints' transforms (55, 3, 4) to one transform (V, 3, 4) of each vertex."""
-    return np.einsum("vk,vkab->vab", weights, transforms[joints])
-
-
-def _skin(
-    points: np.ndarray, transforms: np.ndarray, joints: np.ndarray, weights: np.ndarray
-) -> np.ndarray:
-    blended = _blended(transforms, joints, weights)
-    return np.einsum("vab,vb->va", blended[..., :3], points) + blended[..., 3]
-
-
 def _unskinned(
     points: np.ndarray, transforms: np.ndarray, joints: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
     """Return the rest points that skinning maps to ``points`` (V, 3)."""
-    blended = _blended(transforms, joints, weights)
+    blended = np.einsum("vk,vkab->vab", weights, transforms[joints])  # (V, 3, 4)
     return np.linalg.solve(blended[..., :3], (points - blended[..., 3])[..., None])[..., 0]
 
 
