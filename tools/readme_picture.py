@@ -26,8 +26,8 @@ from intercap_core.output.site.overlays import (
     OBJECT_COLOUR,
     choose_cameras,
     draw_over,
+    middle_of_contact,
 )
-from intercap_core.output.site.preview import middle_of_contact
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import JOINT, SCENE
 
@@ -86,7 +86,7 @@ class Posed:
         pair = self.column.at(t)
         return [
             ColouredMesh(pair.body, self.faces, np.eye(4), colours=BODY_COLOUR),
-            ColouredMesh(pair.vertices, pair.faces, np.eye(4), colours=OBJECT_COLOUR),
+            ColouredMesh(pair.vertices, pair.mesh.faces, np.eye(4), colours=OBJECT_COLOUR),
         ]
 
 

@@ -27,8 +27,15 @@ from intercap_core.output.site.body_section import read_fit
 from intercap_core.output.site.capture_section import read_capture
 from intercap_core.output.site.closeups import closeup, holds, read_handling
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.overlays import PosedFit, choose_cameras, choose_frames, overlays
-from intercap_core.output.site.preview import PREVIEW, Preview, make_preview
+from intercap_core.output.site.embed import PREVIEW
+from intercap_core.output.site.overlays import (
+    PosedFit,
+    Preview,
+    choose_cameras,
+    choose_frames,
+    make_preview,
+    overlays,
+)
 from intercap_core.output.site.sequence_page import SequenceContent, page
 from intercap_core.output.site.track_section import read_track
 from intercap_core.output.viewer import page as viewer

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -13,13 +12,12 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.body.joints import BODY_JOINTS, FINGER_JOINTS, JOINT_NAMES
 from intercap_core.body.keypoints import BODY, FEET, SKELETON, keypoint_pairs
-from intercap_core.errors import UserError
-from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.render import render
 from intercap_core.output.site import charts
-from intercap_core.output.site.drawing import SquareCrop, make_sheet
+from intercap_core.output.site.embed import css
+from intercap_core.output.site.fit_section import SquareCrop, draw_sheet, view_row
 from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import BODY_FIT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -38,20 +36,19 @@ FIT_STATES = {
 
 
 def read_fit(paths: SequencePaths, models: SequenceModels) -> dict[str, Any]:
-    """Read and draw the fit; return the variables of the template body.html.j2.
+    """Read and draw the fit; return the variables of the template fit.html.j2.
 
     If an image is unreadable, ``sheet`` is None and ``note`` has the reason. Raises UserError as
     :func:`artefacts.read` does.
     """
     with artefacts.read(paths.scene, SCENE) as scene:
-        rig, image_of = Rig.from_artefact(scene), scene["image_of"]
+        rig = Rig.from_artefact(scene)
     with artefacts.read(paths.person, PERSON) as person:
         detected = person["keypoints"]
     with artefacts.read(paths.body_fit, BODY_FIT) as fit:
         parameters, model = read_parameters(fit), load_model(models.body_models, models.gender, fit)
         sigma_mm, cloud_mm = 1e3 * fit["joint_sigma"], 1e3 * fit["cloud_residual"]
-        keypoint_px, subject = fit["keypoint_residual"], str(fit.attributes["subject"])
-        name, untrusted = str(fit.attributes["sequence"]), fit["failed"] | fit["bridged"]
+        keypoint_px, untrusted = fit["keypoint_residual"], fit["failed"] | fit["bridged"]
         states = np.where(untrusted, "lost", np.where(fit["uncertain"], "doubtful", "moving"))
     shown = choose_frames(sigma_mm[:, BODY_JOINTS].max(1), 4)
     with torch.no_grad():
@@ -63,25 +60,22 @@ def read_fit(paths: SequencePaths, models: SequenceModels) -> dict[str, Any]:
         i = shown.index(t)
         return _cell(camera, rgb, vertices[i], faces, points[i], detected[t, c])
 
-    sheet, note = None, ""
-    try:
-        with Frames.open(paths.frames) as images:
-            sheet = make_sheet(name, images.showing(image_of), rig, shown, _CELL_PX, draw)
-    except UserError as error:  # an unreadable image must not prevent the page
-        note = str(error)
+    sheet, note = draw_sheet(paths, shown, _CELL_PX, draw)
     return {
-        "name": name,
-        "subject": subject,
+        "of": "body's fit",
         "sheet": sheet,
         "note": note,
+        "colours": [
+            ("the fitted body", css(np.divide(FIT_COLOUR, 255))),
+            ("keypoints of the detector", css(np.divide(KEYPOINT_COLOUR, 255))),
+        ],
         "timeline": _timeline(states.tolist(), cloud_mm, keypoint_px, rig),
-        "charts": [_over_time(sigma_mm), _by_joint(sigma_mm)],
-        "fit_states": list(FIT_STATES.items()),
-        "view_states": list(VIEW_STATES.items()),
-        "colours": {
-            "fit": "#{:02x}{:02x}{:02x}".format(*FIT_COLOUR),
-            "keypoints": "#{:02x}{:02x}{:02x}".format(*KEYPOINT_COLOUR),
-        },
+        "states": FIT_STATES,
+        "marks": "",
+        "view_states": VIEW_STATES,
+        "view_label": "the share of frames that show the person and the median keypoint error",
+        "charts": [_over_time(sigma_mm)],
+        "wide_chart": _by_joint(sigma_mm),
     }
 
 
@@ -105,10 +99,9 @@ def _timeline(states: list[str], cloud_mm: np.ndarray, keypoint_px: np.ndarray, 
     for camera, pixels in zip(rig, keypoint_px.T, strict=True):
         visible = np.isfinite(pixels)
         good = pixels <= GOOD_PX * camera.colour.height / 1080
-        views = np.where(visible, np.where(good, "agrees", "partly"), "nothing").tolist()
         label = f"{100 * visible.mean():.0f} % visible"
         label += f" · {np.median(pixels[visible]):.1f} px" if visible.any() else ""
-        rows.append(charts.TimelineRow(camera.name, charts.state_runs(views, VIEW_STATES), label))
+        rows.append(view_row(camera.name, visible, good, VIEW_STATES, label))
     return charts.timeline(rows, len(states))
 
 
@@ -188,15 +181,11 @@ def _cell(
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, FIT_COLOUR)
     points = apply(camera.colour_from_master, keypoints[BODY])
     known = lens.sees(points)
-    at = crop.to_cell(lens.project(np.where(known[:, None], points, [0.0, 0.0, 1.0])))
+    at = crop.to_cell(lens.project(np.where(known[:, None], points, [0.0, 0.0, 1.0]))).tolist()
     for a, b in _BONES:
         if known[a] and known[b]:
-            cv2.line(cell, _pixel(at[a]), _pixel(at[b]), FIT_COLOUR, 1, cv2.LINE_AA)
+            cv2.line(cell, at[a], at[b], FIT_COLOUR, 1, cv2.LINE_AA)
     confident = detected[BODY][detected[BODY, 2] >= 0.3]  # default of person.min_confidence
-    for dot in crop.to_cell(confident[:, :2]):
-        cv2.circle(cell, _pixel(dot), 2, KEYPOINT_COLOUR, -1, cv2.LINE_AA)
+    for dot in crop.to_cell(confident[:, :2]).tolist():
+        cv2.circle(cell, dot, 2, KEYPOINT_COLOUR, -1, cv2.LINE_AA)
     return cell
-
-
-def _pixel(point: Sequence[int] | np.ndarray) -> tuple[int, int]:
-    return int(point[0]), int(point[1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +25,12 @@ def calibration_page(
         advice: sentences on what to record for weak cameras.
     """
     pairs = [
-        {
-            "name": " and ".join(found.rig.names[c] for c in pair.cameras),
-            "joints": str(pair.joints),
-            "boards": str(pair.boards or ""),
-            "error": "–" if np.isnan(pair.error_px) else f"{pair.error_px:.1f}",
-        }
+        (
+            " and ".join(found.rig.names[c] for c in pair.cameras),
+            pair.joints,
+            pair.boards or "",
+            "–" if np.isnan(pair.error_px) else f"{pair.error_px:.1f}",
+        )
         for pair in found.pairs
     ]
     return embed.render(
@@ -38,29 +38,24 @@ def calibration_page(
         {
             "name": name,
             "drawings": [
-                ("from above", _draw(found, up, 0)),
-                ("from the side", _draw(found, up, 1)),
+                ("from above", _drawing(found, up, 0)),
+                ("from the side", _drawing(found, up, 1)),
             ],
             "legend": [(n, camera_colour(c)) for c, n in enumerate(found.rig.names)],
             "scale": found.scale,
-            "cameras": rows,
+            "cameras": [list(row.values()) for row in rows],
             "pairs": pairs,
             "advice": advice,
         },
     )
 
 
-def _axes(found: FoundRig, up: np.ndarray) -> np.ndarray:
-    """Rows (3, 3): right, ahead and up of the drawings in the master's frame."""
+def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
+    """Shapes, px, of the cameras and the person's way, from above (0) or from the side (1)."""
     ahead = found.rig.master_from_colour[0, :3, 2]
     ahead = ahead - (ahead @ up) * up
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
-    return np.stack([np.cross(ahead, up), ahead, up])
-
-
-def _draw(found: FoundRig, up: np.ndarray, side: int) -> str:
-    """SVG of cameras and the person's way, from above (0) or from the side (1)."""
-    axes = _axes(found, up)[[0, 1] if side == 0 else [0, 2]]
+    axes = np.stack([np.cross(ahead, up), ahead if side == 0 else up])  # right, upwards (2, 3)
     poses = found.rig.master_from_colour
     walk = found.walk[np.isfinite(found.walk[:, 0])]
     corners = []
@@ -81,28 +76,14 @@ def _draw(found: FoundRig, up: np.ndarray, side: int) -> str:
         flat = (points @ axes.T - (low + high) / 2) * scale
         return np.asarray(_SIZE) / 2 + flat * (1, -1)
 
-    view = "from above" if side == 0 else "from the side"
-    parts = [f'<svg viewBox="0 0 {_SIZE[0]} {_SIZE[1]}" role="img" aria-label="Cameras {view}">']
-    if len(walk):
-        way = " ".join(f"{x:.1f},{y:.1f}" for x, y in at(walk))
-        parts.append(f'<polyline points="{way}" fill="none" stroke="currentColor" opacity="0.35"/>')
+    cameras = []
     for c, outline in enumerate(corners):
-        points, colour = at(outline), camera_colour(c)
-        for k in range(4):
-            triangle = points[[0, 1 + k, 1 + (k + 1) % 4]]
-            shape = " ".join(f"{x:.1f},{y:.1f}" for x, y in triangle)
-            parts.append(
-                f'<polygon points="{shape}" fill="{colour}" fill-opacity="0.25" stroke="{colour}"/>'
-            )
-        x, y = points[0]
-        parts.append(
-            f'<text x="{x:.1f}" y="{y - 8:.1f}" text-anchor="middle" fill="currentColor" '
-            f'font-size="12">{escape(found.rig.names[c])}</text>'
-        )
-    bar = scale  # one metre
-    bottom = _SIZE[1] - 10
-    parts.append(
-        f'<path d="M10 {bottom}h{bar:.1f}" stroke="currentColor"/>'
-        f'<text x="10" y="{bottom - 5}" fill="currentColor" font-size="11">1 m</text></svg>'
-    )
-    return "".join(parts)
+        points = at(outline)
+        sides = [_points(points[[0, 1 + k, 1 + (k + 1) % 4]]) for k in range(4)]
+        cameras.append((found.rig.names[c], camera_colour(c), sides, points[0]))
+    return {"size": _SIZE, "way": _points(at(walk)), "cameras": cameras, "metre": scale}
+
+
+def _points(places: np.ndarray) -> str:
+    """Points (N, 2) of an SVG shape."""
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in places)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from intercap_core import artefacts
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.output.site.drawing import EncodedImage, encode_jpeg
+from intercap_core.output.site import charts
+from intercap_core.output.site.drawing import EncodedImage, encode_jpeg, encode_png, pinhole
 from intercap_core.output.site.point_cloud import (
     FusedCloud,
     Viewpoint,
@@ -35,72 +37,46 @@ _SLICE_SIZE = (840, 520)  # px
 _SLICE_THICK_M = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class FloorProfile:
-    """Height over the floor along a strip, as one camera measures it."""
-
-    c: int
-    """Index of the camera."""
-    along: np.ndarray
-    """(N,) position along the strip, metres."""
-    height: np.ndarray
-    """(N,) median height over the floor, metres."""
-
-
-@dataclass(frozen=True, eq=False)
-class CapturePictures:
-    """Pictures of one frame set, before and after refinement."""
-
-    frame: int
-    """Index of the drawn set."""
-    when: tuple[str, ...]
-    """("before", "after"), or ("",) if refinement changed nothing."""
-    views: tuple[tuple[EncodedImage, ...], ...]
-    """By side, then by ``when``."""
-    slice_: tuple[EncodedImage, ...]
-    """By ``when``; empty if no two cameras measure points at the same height."""
-    profiles: tuple[tuple[FloorProfile, ...], ...]
-    """By ``when``, then by camera; empty without a floor."""
-
-
-def draw_capture(images: Frames, scene: artefacts.Artefact) -> CapturePictures:
+def draw_capture(images: Frames, scene: artefacts.Artefact) -> dict[str, Any]:
     """Draw the frame set that most cameras recorded, nearest to the middle of the sequence.
 
     It is drawn before and after refinement if refinement changed a pose. Raises UserError if a
     recorded image does not decode.
+
+    Returns:
+        ``frame``: index of the drawn set.
+        ``pictures``: rows of pictures, before and after; a row for each side, and one for the slice
+            if two cameras measure points at the same height.
+        ``profiles``: caption and chart of the floor, before and after; empty without a floor.
     """
     rig = Rig.from_artefact(scene)
     start = rig.moved(scene["master_from_colour_start"])
     bias = scene["depth_bias"]
-    changed = not np.allclose(start.master_from_colour, rig.master_from_colour) or bias.any()
-    states = [("before", start, np.zeros_like(bias))] if changed else []
-    states.append(("after" if changed else "", rig, bias))
+    states = [("", rig, bias)]
+    if not np.allclose(start.master_from_colour, rig.master_from_colour) or bias.any():
+        states = [
+            ("before refinement", start, np.zeros_like(bias)), ("after refinement", rig, bias)
+        ]  # fmt: skip
     shown = images.showing(scene["image_of"])
     t = choose_set(shown)
     measured = measured_points(shown, rig, t)
     world = scene["zup_from_master"]
     clouds = [fuse(measured, cameras, world, shift) for _, cameras, shift in states]
-    room = _ShownRoom.around(clouds[-1], rig, world)
-    clouds = [cloud.where(room.contains(cloud.points)) for cloud in clouds]
-    level = Slice.of(clouds[-1], room.centre)
-    words = [f"{when} refinement" if when else "" for when, *_ in states]
-    return CapturePictures(
-        frame=t,
-        when=tuple(when for when, *_ in states),
-        views=tuple(
-            tuple(
-                room.picture(side, cloud, cameras, world, word)
-                for cloud, (_, cameras, _), word in zip(clouds, states, words, strict=True)
-            )
-            for side in _SIDES
-        ),
-        slice_=tuple(
-            level.picture(cloud, word) for cloud, word in zip(clouds, words, strict=True) if level
-        ),
-        profiles=tuple(tuple(floor_profiles(cloud, room.centre)) for cloud in clouds)
-        if scene.attributes["ground_found"]
-        else (),
-    )
+    room = _ShownRoom(clouds[-1], rig, world)
+    drawn = [
+        (when, cameras, cloud.where(room.contains(cloud.points)))
+        for (when, cameras, _), cloud in zip(states, clouds, strict=True)
+    ]
+    rows = [
+        [room.picture(side, cloud, cameras, world, when) for when, cameras, cloud in drawn]
+        for side in _SIDES
+    ]
+    chosen = _choose_slice(drawn[-1][-1], room.centre)
+    if chosen is not None:
+        rows.append([_draw_slice(cloud, *chosen, when) for when, _, cloud in drawn])
+    profiles = {when: floor_profiles(cloud, room.centre) for when, _, cloud in drawn}
+    floor = _profile_charts(profiles) if scene.attributes["ground_found"] else []
+    return {"frame": t, "pictures": rows, "profiles": floor}
 
 
 def choose_set(images: Frames) -> int:
@@ -112,8 +88,8 @@ def choose_set(images: Frames) -> int:
     return int(best[np.argmin(np.abs(best - (len(count) - 1) / 2))])
 
 
-def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
-    """Return median heights of the floor along a strip parallel to x, camera by camera.
+def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[charts.Series]:
+    """Return median heights (mm) of the floor along a strip (m) parallel to x, camera by camera.
 
     Five strips near ``centre`` (2,) are compared. The one with the fewest points between 0.08 and
     0.4 m above the floor is used, because such points belong to legs and furniture.
@@ -135,34 +111,39 @@ def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
         middle = (first + count // 2)[kept]
         if kept.sum() >= 2:
             along = (places[kept] + 0.5) * bin_m
-            profiles.append(FloorProfile(int(c), along, points[order][middle, 2].astype(float)))
+            height_mm = 1e3 * points[order][middle, 2].astype(float)
+            profiles.append(charts.Series("", camera_colour(c), along, height_mm))
     return profiles
 
 
-@dataclass(frozen=True, eq=False)
+def _profile_charts(profiles: Mapping[str, Sequence[charts.Series]]) -> list[tuple[str, str]]:
+    """Plot the floor before and after refinement with one scale: (caption, SVG)."""
+    every = [line for lines in profiles.values() for line in lines]
+    if not every:
+        return []
+    top = 10 * float(np.ceil(max(10.0, *(np.abs(line.y).max() for line in every)) / 10))
+    low, high = (float(f(np.concatenate([line.x for line in every]))) for f in (np.min, np.max))
+    axes = ("along the strip, m", low, high), ("height over the floor, mm", -top, top)
+    name = "the floor along a strip near the middle"
+    return [
+        (_captioned(name, when), charts.line_chart(lines, *axes))
+        for when, lines in profiles.items()
+    ]
+
+
 class _ShownRoom:
-    """The part of the room that is shown, z up."""
+    """The part of the room that is shown, z up: a circle on the floor around ``centre`` (2,)."""
 
-    centre: np.ndarray
-    """(2,) middle of the shown part on the floor, metres."""
-    radius: float
-    """Radius of the shown part on the floor, metres."""
-    azimuth: float
-    """Azimuth of the first camera as seen from the centre, radians."""
-    gain: float
-    """Factor that brightens dark images."""
-
-    @classmethod
-    def around(cls, cloud: FusedCloud, rig: Rig, world_from_master: np.ndarray) -> _ShownRoom:
+    def __init__(self, cloud: FusedCloud, rig: Rig, world_from_master: np.ndarray) -> None:
         eyes = apply(world_from_master, rig.master_from_colour[:, :3, 3])
         centre = np.median(cloud.points[:, :2], 0) if len(cloud.points) else eyes[:, :2].mean(0)
         reach = np.linalg.norm(eyes[:, :2] - centre, axis=1).max() + 0.35
-        radius = float(np.clip(reach, 1.0, 4.0))
         first = eyes[0, :2] - centre
         bright = float(np.percentile(cloud.colours, 98)) if len(cloud.colours) else 1.0
-        gain = float(np.clip(0.95 / max(bright, 1e-3), 1, 1.5))
-        azimuth = float(np.arctan2(first[1], first[0]))
-        return cls(centre.astype(np.float64), radius, azimuth, gain)
+        self.centre = centre.astype(np.float64)
+        self.radius = float(np.clip(reach, 1.0, 4.0))  # metres
+        self.azimuth = float(np.arctan2(first[1], first[0]))  # of the first camera, radians
+        self.gain = float(np.clip(0.95 / max(bright, 1e-3), 1, 1.5))  # brightens dark images
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return a mask (N,) of the points (N, 3) within the radius and -0.25 to 2.6 m high."""
@@ -179,13 +160,12 @@ class _ShownRoom:
     ) -> EncodedImage:
         """Draw the coloured cloud with the floor's grid and the cameras."""
         name, azimuth, elevation = side
-        target = np.append(self.centre, 0.65)  # metres above the floor
+        target, lens = np.append(self.centre, 0.65), pinhole(840, 560, 900.0)  # 0.65 m high
         places = [_frustum(camera, world @ camera.master_from_colour) for camera in rig]
         for distance in np.arange(2.2, 4.0, 0.1) * self.radius:  # the nearest that shows all
             view = Viewpoint.towards(
-                target, self.azimuth + np.radians(azimuth), np.radians(elevation), distance,
-                900.0, (840, 560),  # focal length and image size, pixels
-            )  # fmt: skip
+                target, self.azimuth + np.radians(azimuth), np.radians(elevation), distance, lens
+            )
             if view.contains(np.concatenate(places), 24):
                 break
         colours, depth = splat(cloud, view)
@@ -211,10 +191,7 @@ class _ShownRoom:
                 ends[:, 1 - axis] += (-half, half)
                 _draw_lines(layer, view, ends[None], 255)
         rows, columns = np.nonzero(layer)
-        local = np.column_stack(
-            [(columns - (view.width - 1) / 2) / view.focal, (rows - (view.height - 1) / 2)
-             / view.focal, np.ones(len(rows))]
-        )  # fmt: skip
+        local = np.column_stack([view.lens.rays[rows, columns], np.ones(len(rows))])
         up = view.view_from_world[:3, 2]
         # depth at which each pixel's ray meets the plane z = 0
         floor_z = -(view.eye[2]) / np.minimum(local @ up, -1e-6)
@@ -266,55 +243,46 @@ def _draw_lines(
         cv2.line(picture, a, b, colour, thick, cv2.LINE_AA, _SHIFT)
 
 
-@dataclass(frozen=True)
-class Slice:
-    """A horizontal rectangle of the room."""
+def _choose_slice(cloud: FusedCloud, centre: np.ndarray) -> tuple[float, np.ndarray, float] | None:
+    """Choose the height, from 0.3 to 1.7 m, at which most cameras see points near the centre.
 
-    height: float
-    """Metres."""
-    centre: np.ndarray
-    """(2,) metres."""
-    scale: float
-    """Pixels per metre."""
+    A camera counts with 40 points. Among equal heights, the one with most points is chosen. Returns
+    height (m), middle (2,) (m) and scale (pixels per metre) of a picture; None if no two cameras
+    see points at the same height.
+    """
+    near = np.abs(cloud.points[:, :2] - centre).max(1) < 0.9
+    best, chosen = (1, 0), None
+    for height in (0.1 * n for n in range(3, 18)):
+        inside = near & (np.abs(cloud.points[:, 2] - height) < _SLICE_THICK_M / 2)
+        counts = np.bincount(cloud.camera[inside])
+        score = (int((counts >= 40).sum()), int(inside.sum()))
+        if score[0] >= 2 and score > best:
+            best, chosen = score, (height, cloud.points[inside, :2])
+    if chosen is None:
+        return None
+    low, high = np.percentile(chosen[1], (1, 99), axis=0)
+    extent = np.maximum(1.15 * (high - low), 0.5)
+    return chosen[0], (low + high) / 2, float((np.array(_SLICE_SIZE) / extent).min())
 
-    @classmethod
-    def of(cls, cloud: FusedCloud, centre: np.ndarray) -> Slice | None:
-        """Choose the height, from 0.3 to 1.7 m, at which most cameras see points near the centre.
 
-        A camera counts with 40 points. Among equal heights, the one with most points is chosen.
-        None if no two cameras see points at the same height.
-        """
-        near = np.abs(cloud.points[:, :2] - centre).max(1) < 0.9
-        best, chosen = (1, 0), None
-        for height in (0.1 * n for n in range(3, 18)):
-            inside = near & (np.abs(cloud.points[:, 2] - height) < _SLICE_THICK_M / 2)
-            counts = np.bincount(cloud.camera[inside])
-            score = (int((counts >= 40).sum()), int(inside.sum()))
-            if score[0] >= 2 and score > best:
-                best, chosen = score, (height, cloud.points[inside, :2])
-        if chosen is None:
-            return None
-        low, high = np.percentile(chosen[1], (1, 99), axis=0)
-        extent = np.maximum(1.15 * (high - low), 0.5)
-        return cls(chosen[0], (low + high) / 2, float((np.array(_SLICE_SIZE) / extent).min()))
-
-    def picture(self, cloud: FusedCloud, when: str) -> EncodedImage:
-        """Draw the points at this height from above in their cameras' colours, with a scale."""
-        width, height = _SLICE_SIZE
-        inside = np.abs(cloud.points[:, 2] - self.height) < _SLICE_THICK_M / 2
-        at = (cloud.points[inside, :2] - self.centre) * [self.scale, -self.scale]
-        at = np.rint(2**_SHIFT * (at + np.array(_SLICE_SIZE) / 2)).astype(int)
-        cameras = cloud.camera[inside]
-        picture = np.full((height, width, 3), np.rint(_GROUND * 255), np.uint8)
-        # Drawn in a pseudo-random order (multiplicative hash), so that no camera covers the others
-        order = np.argsort(np.arange(len(at)) * 2654435761 % 2**32, kind="stable")
-        for place, c in zip(at[order].tolist(), cameras[order].tolist(), strict=True):
-            cv2.circle(picture, place, 2 << _SHIFT, _rgb(c), -1, cv2.LINE_AA, _SHIFT)
-        x, y, bar = 18, height - 20, round(0.1 * self.scale)
-        cv2.line(picture, (x, y), (x + bar, y), _INK, 2)
-        cv2.putText(picture, "10 cm", (x, y - 8), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
-        name = _captioned(f"slice at {self.height:.1f} m", when)
-        return _encode_png(picture, name)
+def _draw_slice(
+    cloud: FusedCloud, level: float, middle: np.ndarray, scale: float, when: str
+) -> EncodedImage:
+    """Draw the points at a height from above in their cameras' colours, with a scale."""
+    inside = np.abs(cloud.points[:, 2] - level) < _SLICE_THICK_M / 2
+    at = (cloud.points[inside, :2] - middle) * [scale, -scale]
+    at = np.rint(2**_SHIFT * (at + np.array(_SLICE_SIZE) / 2)).astype(int)
+    cameras = cloud.camera[inside]
+    picture = np.full((*_SLICE_SIZE[::-1], 3), np.rint(_GROUND * 255), np.uint8)
+    # Drawn in a pseudo-random order (multiplicative hash), so that no camera covers the others
+    order = np.argsort(np.arange(len(at)) * 2654435761 % 2**32, kind="stable")
+    for place, c in zip(at[order].tolist(), cameras[order].tolist(), strict=True):
+        cv2.circle(picture, place, 2 << _SHIFT, _rgb(c), -1, cv2.LINE_AA, _SHIFT)
+    x, y, bar = 18, _SLICE_SIZE[1] - 20, round(0.1 * scale)
+    cv2.line(picture, (x, y), (x + bar, y), _INK, 2)
+    cv2.putText(picture, "10 cm", (x, y - 8), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
+    name = _captioned(f"slice at {level:.1f} m", when)
+    return encode_png(picture / np.float32(255), name)
 
 
 def camera_colour(c: int) -> str:
@@ -328,9 +296,3 @@ def _rgb(c: int) -> tuple[int, ...]:
 
 def _captioned(name: str, when: str) -> str:
     return f"{name}, {when}" if when else name
-
-
-def _encode_png(rgb: np.ndarray, caption: str) -> EncodedImage:
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    data = cv2.imencode(".png", rgb[..., ::-1], options)[1].tobytes()
-    return EncodedImage(data, "png", rgb.shape[1], rgb.shape[0], caption)

@@ -10,15 +10,10 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.evaluation import flags
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.output.export.motion import describe_up
-from intercap_core.output.site import charts, embed
-from intercap_core.output.site.capture_pictures import (
-    CapturePictures,
-    camera_colour,
-    draw_capture,
-)
+from intercap_core.output.site import charts
+from intercap_core.output.site.capture_pictures import camera_colour, draw_capture
 from intercap_core.schemas import FRAMES, SCENE
 
 _MAX_PAIRS = 45  # drawn pairs of cameras
@@ -38,7 +33,8 @@ def read_capture(frames: Path, scene: Path) -> dict[str, Any]:
     as :func:`artefacts.read` does.
     """
     with artefacts.read(frames, FRAMES) as recorded, artefacts.read(scene, SCENE) as refined:
-        drawn, note = None, ""
+        drawn: dict[str, Any] = {"frame": None, "pictures": [], "profiles": []}
+        note = ""
         try:
             drawn = draw_capture(Frames(recorded), refined)
         except UserError as error:  # an unreadable image must not prevent the page
@@ -52,13 +48,11 @@ def read_capture(frames: Path, scene: Path) -> dict[str, Any]:
             "note": note,
             "verdict": str(refined.attributes["verdict"]),
             "ground": _ground(refined),
-            "frame": drawn.frame if drawn else None,
-            "pictures": [row for row in (*drawn.views, drawn.slice_) if row] if drawn else [],
-            "profiles": _profile_charts(drawn) if drawn else [],
+            **drawn,
             "pairs": _pair_charts(refined, names),
             "pairs_left_out": max(0, len(refined["pairs"]) - _MAX_PAIRS),
             "timeline": charts.timeline(rows, len(times), marks),
-            "states": list(STATES.items()),
+            "states": STATES,
             "gaps": [f"after frame {t} ({count} {_sets(count)})" for t, count in missing],
             "cameras": cameras,
             "legend": [(name, camera_colour(c)) for c, name in enumerate(names)],
@@ -189,18 +183,14 @@ def _pair_charts(scene: artefacts.Artefact, names: Sequence[str]) -> list[tuple[
 
 
 def _runs(states: Sequence[str], slip: np.ndarray) -> list[tuple[int, int, str, str]]:
-    """Return the runs of a :class:`.charts.TimelineRow`; slips (T,) are part of the tooltips."""
+    """Return the runs of a :class:`.charts.TimelineRow`; slips (T,) are part of the words."""
+    late = slip.tolist()
+    words = STATES | {f"slipped {n}": f"{STATES['slipped']}, {n} {_sets(n)} before" for n in late}
     slipped = [
-        f"slipped by {late}" if state == "slipped" else state
-        for state, late in zip(states, slip.tolist(), strict=True)
+        f"slipped {n}" if state == "slipped" else state
+        for state, n in zip(states, late, strict=True)
     ]
-    runs = []
-    for first, last, text in flags.ranges(slipped):
-        state, _, frames = text.partition(" by ")
-        late = f", {frames} {'frame' if frames == '1' else 'frames'} before" if frames else ""
-        title = f"{embed.span(first, last)}: {STATES[state]}{late}"
-        runs.append((first, last, f"state {state}", title))
-    return runs
+    return charts.state_runs(slipped, words)
 
 
 def _row_label(states: Sequence[str], slip: np.ndarray, times: np.ndarray, delay: str) -> str:
@@ -221,30 +211,6 @@ def _row_label(states: Sequence[str], slip: np.ndarray, times: np.ndarray, delay
     parts = [f"{times[0]:.2f}–{times[-1]:.2f} s"]
     parts += [f"{n} {word}" for state, word in words.items() if (n := states.count(state))]
     return " · ".join([*parts, f"{delay} ms"] if delay else parts)
-
-
-def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
-    """Plot the floor before and after refinement with one scale: (caption, SVG)."""
-    every = [profile for profiles in drawn.profiles for profile in profiles]
-    if not every:
-        return []
-    top = max(10.0, *(1e3 * float(np.abs(p.height).max()) for p in every))
-    top = 10 * float(np.ceil(top / 10))
-    low = min(float(p.along.min()) for p in every)
-    high = max(float(p.along.max()) for p in every)
-    plots = []
-    for when, profiles in zip(drawn.when, drawn.profiles, strict=True):
-        series = [charts.Series("", camera_colour(p.c), p.along, 1e3 * p.height) for p in profiles]
-        chart = charts.line_chart(
-            series,
-            x_label="along the strip, m",
-            y_label="height over the floor, mm",
-            x_range=(low, high),
-            y_range=(-top, top),
-        )
-        refinement = f", {when} refinement" if when else ""
-        plots.append((f"the floor along a strip near the middle{refinement}", chart))
-    return plots
 
 
 def _sets(count: int) -> str:

@@ -10,6 +10,8 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from intercap_core.evaluation import flags
+from intercap_core.geometry.solve.time_series import runs
+from intercap_core.output.site.embed import span
 
 _WIDTH = 440  # width of a line chart, px; readable on a phone
 _LEFT = 56  # left edge of its axes, px
@@ -27,19 +29,18 @@ class Series:
     x: np.ndarray
     """(N,)"""
     y: np.ndarray
-    """(N,)"""
+    """(N,); the line has a gap where a value is NaN."""
+
+
+Axis = tuple[str, float, float]
+"""Label, lower and upper end."""
 
 
 def line_chart(
-    series: Sequence[Series],
-    *,
-    x_label: str,
-    y_label: str,
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
-    marks: Sequence[tuple[float, str]] = (),
+    series: Sequence[Series], x_axis: Axis, y_axis: Axis, marks: Sequence[tuple[float, str]] = ()
 ) -> str:
     """Plot lines with axes, grid and legend; ``marks`` are labelled vertical lines."""
+    (x_label, *x_range), (y_label, *y_range) = x_axis, y_axis
     named = [line for line in series if line.name]
     legend = _legend([line.name for line in named])
     legend_row, right, bottom = 18, 16, 44
@@ -67,11 +68,12 @@ def line_chart(
         parts.append(f'<line class="mark" {_same("x", x)} y1="{top}" y2="{top + inner_height}"/>')
         parts.append(_text(x + 3, top + 10, label, "tick", "start"))
     for line in series:
-        points = " ".join(
-            f"{at_x(float(x)):.1f},{at_y(float(y)):.1f}"
-            for x, y in zip(line.x, line.y, strict=True)
-        )
-        parts.append(f'<polyline {_stroke(line.colour)} points="{points}"/>')
+        for first, last in runs(np.isfinite(line.y)):
+            points = " ".join(
+                f"{at_x(float(line.x[i])):.1f},{at_y(float(line.y[i])):.1f}"
+                for i in range(first, last + 1)
+            )
+            parts.append(f'<polyline {_stroke(line.colour)} points="{points}"/>')
     for line, (x, row) in zip(named, legend, strict=True):
         y = 14 + legend_row * row
         ends = f'x1="{x:.1f}" x2="{x + 20:.1f}"'
@@ -87,9 +89,8 @@ def line_chart(
 
 def frame_chart(series: Sequence[Series], total: int, y_label: str, least: float = 10.0) -> str:
     """Plot lines over ``total`` frames; the vertical axis reaches at least to ``least``."""
-    top = max(least, *(1.1 * float(line.y.max(initial=0.0)) for line in series))
-    x_range = (0.0, float(max(total - 1, 1)))
-    return line_chart(series, x_label="frame", y_label=y_label, x_range=x_range, y_range=(0.0, top))
+    top = max(least, *(1.1 * float(np.nanmax(line.y, initial=0.0)) for line in series))
+    return line_chart(series, ("frame", 0.0, max(total - 1, 1)), (y_label, 0.0, top))
 
 
 def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
@@ -111,7 +112,8 @@ class TimelineRow:
     name: str
     """Text at the beginning of the row."""
     runs: Sequence[tuple[int, int, str, str]]
-    """First and last frame, CSS classes and tooltip of each run of frames."""
+    """First and last frame, CSS classes and words of each run of frames; the tooltip has the frames
+    and the words."""
     label: str = ""
     """Text at the end of the row."""
     levels: np.ndarray | None = None
@@ -146,9 +148,10 @@ def timeline(rows: Sequence[TimelineRow], total: int, marks: Sequence[tuple[int,
                 f'H{at_x(total):.1f}V{y + tall}Z"/><line class="half" x1="{left}" '
                 f'x2="{left + inner}" {_same("y", y + tall / 2)}/>'
             )
-        for first, last, css, title in row.runs:
+        for first, last, css, words in row.runs:
             x = at_x(first)
             long = max(1.5, at_x(last + 1) - x)
+            title = f"{span(first, last)}: {words}" if words else span(first, last)
             parts.append(
                 f'<rect class="{css}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
                 f'height="{tall}" rx="2"><title>{escape(title)}</title></rect>'
@@ -174,11 +177,8 @@ def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
 
 
 def state_runs(states: Sequence[str], words: Mapping[str, str]) -> list[tuple[int, int, str, str]]:
-    """Return the runs of a :class:`TimelineRow`; ``words`` has the tooltip of each state."""
-    return [
-        (a, b, f"state {state}", f"{a}–{b}: {words[state]}" if b > a else f"{a}: {words[state]}")
-        for a, b, state in flags.ranges(states)
-    ]
+    """Return the runs of a :class:`TimelineRow`; ``words``: by state."""
+    return [(a, b, f"state {state}", words[state]) for a, b, state in flags.ranges(states)]
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,9 @@ class BarPair:
     """The values have little support."""
 
     @classmethod
-    def change(cls, name: str, before: float, after: float, note: str, weak: bool) -> BarPair:
+    def change(
+        cls, name: str, before: float, after: float, note: str = "", weak: bool = False
+    ) -> BarPair:
         """Return a pair that is labelled with both values."""
         values = " → ".join(f"{v:.1f}" if math.isfinite(v) else "–" for v in (before, after))
         label = f"{values}{f'  ·  {note}' if note else ''}{', little overlap' if weak else ''}"

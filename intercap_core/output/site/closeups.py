@@ -8,7 +8,7 @@ picture is one result; all columns have the same viewpoints.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,20 +22,12 @@ from intercap_core.evaluation.proximity import BodySurface, PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.solve.time_series import runs
-from intercap_core.output.site.drawing import (
-    ColouredMesh,
-    EncodedImage,
-    draw,
-    encode_jpeg,
-    look_along,
-    put_text,
-)
+from intercap_core.output.site import drawing
 from intercap_core.output.site.embed import span
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.schemas import CONTACT_M, JOINT, SCENE
@@ -54,12 +46,7 @@ class Column:
     name: str
     body: Callable[[int], np.ndarray]
     """Returns the body's vertices (V, 3) of a frame."""
-    vertices: np.ndarray
-    """(Vo, 3) of the object, in its own frame."""
-    faces: np.ndarray
-    """(Fo, 3) of the object."""
-    watertight: bool
-    """Whether the object's mesh is closed."""
+    mesh: ObjectMesh
     rotation: np.ndarray
     """(T, 3, 3) master_from_object."""
     translation: np.ndarray
@@ -67,12 +54,8 @@ class Column:
 
     def at(self, t: int) -> PosedPair:
         """Pose body and object in frame ``t``."""
-        return PosedPair(
-            self.body(t).astype(np.float64),
-            self.vertices @ self.rotation[t].T + self.translation[t],
-            self.faces,
-            self.watertight,
-        )
+        vertices = self.mesh.vertices @ self.rotation[t].T + self.translation[t]
+        return PosedPair(self.body(t).astype(np.float64), vertices, self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +66,12 @@ class PosedPair:
     """(V, 3)"""
     vertices: np.ndarray
     """(Vo, 3) of the object."""
-    faces: np.ndarray
-    """(Fo, 3) of the object."""
-    watertight: bool
+    mesh: ObjectMesh
+    """The object in its own frame."""
 
     @cached_property
     def _object(self) -> PosedObject:
-        return PosedObject(self.vertices, self.faces, watertight=self.watertight)
+        return PosedObject(self.vertices, self.mesh.faces, watertight=self.mesh.watertight)
 
     def distance(self) -> np.ndarray:
         """Return signed distances (V,) of the body's vertices to the object."""
@@ -110,7 +92,6 @@ class Handling:
     columns: tuple[Column, ...]
     """The last column is the truth if ``has_truth``."""
     has_truth: bool
-    """Whether the truth is known."""
     probability: np.ndarray
     """(T, 2) probability of contact of the left and right hand."""
     up: np.ndarray
@@ -128,12 +109,10 @@ class Hold:
 
     @property
     def frame(self) -> int:
-        """The middle frame."""
         return (self.first + self.last) // 2
 
     @property
     def caption(self) -> str:
-        """Caption of a picture."""
         frames = span(self.first, self.last)
         return f"{self.side} hand, frames {frames}, drawn at {self.frame}"
 
@@ -145,24 +124,15 @@ def read_handling(paths: SequencePaths, models: SequenceModels, *, truth: Path |
     """
     assert models.object_ is not None
     mesh = ObjectMesh.load(models.object_)
-    body_models, gender = models.body_models, models.gender
-
-    joint_body = read_body(paths.joint, "joint", body_models, gender)
-    columns = [
-        Column(
-            name, body.frame, mesh.vertices, mesh.faces, mesh.watertight, pose.rotation,
-            pose.translation,
-        )
-        for name, body, pose in (
-            (
-                "per-stage",
-                read_body(paths.body_fit, "body_fit", body_models, gender),
-                read_object(paths.object_track, "object_track"),
-            ),
-            ("joint", joint_body, read_object(paths.joint, "joint")),
-        )
-    ]  # fmt: skip
-    model = joint_body.model
+    columns = []
+    for name, body_stage, object_stage in (
+        ("per-stage", "body_fit", "object_track"),
+        ("joint", "joint", "joint"),
+    ):
+        body = read_body(getattr(paths, body_stage), body_stage, models.body_models, models.gender)
+        pose = read_object(getattr(paths, object_stage), object_stage)
+        columns.append(Column(name, body.frame, mesh, pose.rotation, pose.translation))
+    model = body.model
     with artefacts.read(paths.joint, JOINT) as joint:
         regions = joint.text("region_names")
         hands = [regions.index(f"{side}_hand") for side in SIDES]
@@ -175,12 +145,9 @@ def read_handling(paths: SequencePaths, models: SequenceModels, *, truth: Path |
         true = Truth.load(truth, times, fps, model.num_vertices)
         if true.vertices is not None:
             has_truth = True
-            columns.append(
-                Column(
-                    "truth", true.vertices.__getitem__, true.object_vertices, true.object_faces,
-                    mesh.watertight, true.rotation, true.translation,
-                )
-            )  # fmt: skip
+            mesh = replace(mesh, vertices=true.object_vertices, faces=true.object_faces)
+            at = true.vertices.__getitem__
+            columns.append(Column("truth", at, mesh, true.rotation, true.translation))
     return Handling(model, tuple(columns), has_truth, probability, up)
 
 
@@ -194,7 +161,7 @@ def holds(probability: np.ndarray) -> list[Hold]:
     return sorted(found, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
 
 
-def closeup(handling: Handling, hold: Hold) -> EncodedImage:
+def closeup(handling: Handling, hold: Hold) -> drawing.EncodedImage:
     """Draw one hold: a row for each viewpoint, a column for each result."""
     model, t = handling.model, hold.frame
     hand = np.asarray(model.regions[f"{hold.side}_hand"])
@@ -211,22 +178,23 @@ def closeup(handling: Handling, hold: Hold) -> EncodedImage:
         touching = pair.touching(model.faces.numpy())[:, None]
         skin = np.where(touching, TOUCHING_COLOUR, BODY_COLOUR)
         for row, view in enumerate(views):
-            body = ColouredMesh(pair.body, arms, view, colours=skin)
-            object_ = ColouredMesh(pair.vertices, pair.faces, view, colours=OBJECT_COLOUR)
-            picture = draw([body, object_], _lens(_CELL_PX))
+            body = drawing.ColouredMesh(pair.body, arms, view, colours=skin)
+            object_ = drawing.ColouredMesh(
+                pair.vertices, pair.mesh.faces, view, colours=OBJECT_COLOUR
+            )
+            picture = drawing.draw([body, object_], _lens(_CELL_PX))
             y, x = head + row * step, c * step
             sheet[y : y + _CELL_PX, x : x + _CELL_PX] = np.rint(255 * picture.over(white))
         label = column.name
         if handling.has_truth and c < len(pairs) - 1:
             off = np.linalg.norm((pair.body - pairs[-1].body)[hand], axis=1).mean()
             label += f", hand {1e3 * off:.1f} mm off"
-        put_text(sheet, label, (c * step + 3, 13), 0.4, (40, 44, 52))
-    return encode_jpeg(sheet / np.float32(255), hold.caption)
+        drawing.put_text(sheet, label, (c * step + 3, 13), 0.4, (40, 44, 52))
+    return drawing.encode_jpeg(sheet / np.float32(255), hold.caption)
 
 
 def _lens(pixels: int) -> Intrinsics:
-    focal, middle = pixels * _DISTANCE_M / 0.25, (pixels - 1) / 2  # shows 0.25 m at the hand
-    return Intrinsics(pixels, pixels, focal, focal, middle, middle)
+    return drawing.pinhole(pixels, pixels, pixels * _DISTANCE_M / 0.25)  # shows 0.25 m at the hand
 
 
 def _forearm_faces(model: BodyModel) -> np.ndarray:
@@ -255,10 +223,10 @@ def _viewpoints(
     showing = near[arms].any(1)  # by face
     lens, candidates = _lens(48), []
     for direction in _directions(up):
-        turn = look_along(direction, up)
-        pose = rigid(turn, turn @ (direction * _DISTANCE_M - target))
+        pose = drawing.look_at(target, direction, up, _DISTANCE_M)
         drawn = render_scene(
-            [Drawable(fitted.body, arms, pose), Drawable(fitted.vertices, fitted.faces, pose)], lens
+            [Drawable(fitted.body, arms, pose), Drawable(fitted.vertices, fitted.mesh.faces, pose)],
+            lens,
         )
         skin = int(showing[drawn.face[drawn.body == 0]].sum())
         visible = int((drawn.body == 1).sum())

@@ -1,25 +1,26 @@
-"""Encoded images, anti-aliased renderings of meshes, and sheets of small pictures."""
+"""Encoded images, and anti-aliased renderings of meshes."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import trimesh
 from PIL import Image
 
-from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.rigid.surfaces import vertex_normals
+
+Kind = Literal["jpeg", "png", "webp"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +28,7 @@ class EncodedImage:
     """A compressed image for a page."""
 
     content: bytes
-    """Content of the image file."""
-    kind: Literal["jpeg", "png", "webp"]
+    kind: Kind
     width: int
     height: int
     caption: str = ""
@@ -65,6 +65,12 @@ class RenderedImage:
     def over(self, background: np.ndarray, opacity: float = 1.0) -> np.ndarray:
         """Blend over an image (H, W, 3) in 0..1."""
         return self.rgb * opacity + background * (1 - opacity * self.alpha[..., None])
+
+    @property
+    def rgba(self) -> np.ndarray:
+        """(H, W, 4) in 0..1, not premultiplied."""
+        alpha = self.alpha[..., None]
+        return np.concatenate([self.rgb / np.maximum(alpha, 1e-6), alpha], 2)
 
 
 def draw(meshes: Sequence[ColouredMesh], lens: Intrinsics) -> RenderedImage:
@@ -122,114 +128,51 @@ def look_along(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(direction, right), direction])
 
 
+def look_at(
+    target: np.ndarray, direction: np.ndarray, up: np.ndarray, distance: float
+) -> np.ndarray:
+    """Return the transform (4, 4) to the frame of a camera that sees ``target`` in its middle.
+
+    The camera is ``distance`` metres away and looks along a unit ``direction``.
+    """
+    turn = look_along(direction, up)
+    return rigid(turn, turn @ (distance * direction - target))
+
+
+def pinhole(width: int, height: int, focal: float) -> Intrinsics:
+    """Return a lens without distortion, whose axis is in the middle of the image."""
+    return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
 def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
     """Encode an image (H, W, 3) in 0..1 as JPEG."""
-    bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 82, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    data = cv2.imencode(".jpg", bgr, options)[1].tobytes()
-    return EncodedImage(data, "jpeg", bgr.shape[1], bgr.shape[0], caption)
+    return _encode([rgb], "jpeg", caption, quality=82, optimize=True)
+
+
+def encode_png(pixels: np.ndarray, caption: str = "") -> EncodedImage:
+    """Encode an image (H, W, 3), or (H, W, 4) with transparency, in 0..1 as PNG."""
+    return _encode([pixels], "png", caption, compress_level=9)
 
 
 def encode_animation(pictures: Sequence[np.ndarray], seconds: float, caption: str) -> EncodedImage:
     """Encode images (H, W, 3) in 0..1 as an endless animated WebP of ``seconds`` per round."""
-    images = [
-        Image.fromarray(np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)) for rgb in pictures
-    ]
-    stream = io.BytesIO()
-    images[0].save(
-        stream, "WEBP", save_all=True, append_images=images[1:], loop=0, quality=60, method=4,
-        duration=max(1, round(1e3 * seconds / len(images))),
-    )  # fmt: skip
-    return EncodedImage(stream.getvalue(), "webp", images[0].width, images[0].height, caption)
+    duration = max(1, round(1e3 * seconds / len(pictures)))
+    return _encode(
+        pictures, "webp", caption, save_all=True, loop=0, quality=60, method=4, duration=duration
+    )
 
 
-def encode_png(picture: RenderedImage, caption: str = "") -> EncodedImage:
-    """Encode a rendering as PNG with transparency."""
-    alpha = picture.alpha[..., None]
-    straight = picture.rgb / np.maximum(alpha, 1e-6)
-    bgra = np.concatenate([straight[..., ::-1], alpha], 2)
-    pixels = np.rint(np.clip(bgra, 0, 1) * 255).astype(np.uint8)
-    data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
-    return EncodedImage(data, "png", pixels.shape[1], pixels.shape[0], caption)
-
-
-@dataclass(frozen=True)
-class SquareCrop:
-    """A square part of an image, shown at another size."""
-
-    x0: int
-    """Left edge in the image, pixels; may be negative."""
-    y0: int
-    """Upper edge in the image, pixels; may be negative."""
-    size: int
-    """Side in pixels of the image."""
-    cell: int
-    """Side in pixels of the cell in which it is shown."""
-
-    def extract(self, rgb: np.ndarray) -> np.ndarray:
-        """Cut the square out of an image (H, W, 3); border pixels are repeated beyond its edge."""
-        centre = (self.x0 + (self.size - 1) / 2, self.y0 + (self.size - 1) / 2)
-        window = cv2.getRectSubPix(np.ascontiguousarray(rgb), (self.size, self.size), centre)
-        return cv2.resize(window, (self.cell, self.cell), interpolation=cv2.INTER_AREA)
-
-    def outline(
-        self, cell: np.ndarray, mask: np.ndarray, x: int, y: int, colour: tuple[int, int, int]
-    ) -> None:
-        """Draw the contour of a mask (h, w) into the ``cell`` that :meth:`extract` returned.
-
-        The mask's upper left corner is at image pixel (x, y).
-        """
-        square = np.zeros((self.size, self.size), np.uint8)
-        height, width = mask.shape
-        x, y = x - self.x0, y - self.y0
-        left, top = max(x, 0), max(y, 0)
-        right, bottom = min(x + width, self.size), min(y + height, self.size)
-        if right > left and bottom > top:
-            square[top:bottom, left:right] = mask[top - y : bottom - y, left - x : right - x]
-        small = cv2.resize(square, (self.cell, self.cell), interpolation=cv2.INTER_NEAREST)
-        contours, _ = cv2.findContours(small, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(cell, contours, -1, colour, 1, cv2.LINE_AA)
-
-    def to_cell(self, pixels: np.ndarray) -> np.ndarray:
-        """Convert image pixels (N, 2) to whole pixels of the cell."""
-        scaled = (pixels - [self.x0, self.y0] + 0.5) * (self.cell / self.size) - 0.5
-        return np.rint(np.clip(scaled, -1e4, 1e4)).astype(int)
-
-
-CellDrawer = Callable[[Camera, int, int, np.ndarray], np.ndarray | None]
-
-
-def make_sheet(
-    name: str, images: Frames, rig: Rig, frames: Sequence[int], cell_px: int, draw_cell: CellDrawer
+def _encode(
+    pictures: Sequence[np.ndarray], kind: Kind, caption: str, **options: Any
 ) -> EncodedImage:
-    """Draw a table of small pictures: a row per frame, a column per camera.
-
-    Args:
-        name: name of the sequence.
-        images: images by the frame that they show (:meth:`Frames.showing`).
-        cell_px: side of a cell.
-        draw_cell: called with camera, frame, index of the camera and RGB image; returns the cell,
-            or None if nothing is in view.
-    """
-    step, head = cell_px + 4, 18
-    bright, dim = (235, 235, 235), (120, 128, 138)  # RGB
-    sheet = np.empty((len(frames) * step + head, len(rig) * step, 3), np.uint8)
-    sheet[:] = (19, 22, 27)
-    for c, camera in enumerate(rig):
-        put_text(sheet, camera.name[:16], (c * step + 4, 13), 0.42, bright)
-        for row, t in enumerate(frames):
-            image = images.colour(t, c)
-            cell = None if image is None else draw_cell(camera, t, c, image[..., ::-1])
-            y, x = head + row * step, c * step
-            if cell is not None:
-                sheet[y : y + cell_px, x : x + cell_px] = cell
-            if c == 0 or cell is None:
-                label = f"frame {t}" if c == 0 else "no image" if image is None else "not in view"
-                ink = bright if cell is not None else dim
-                put_text(sheet, label, (x + 4, y + 13), 0.4, (0, 0, 0), 3)
-                put_text(sheet, label, (x + 4, y + 13), 0.4, ink)
-    caption = f"{name}, frames {', '.join(map(str, frames))} in every camera"
-    return encode_jpeg(sheet / np.float32(255), caption)
+    """Encode one image, or several as an animation, with Pillow's ``options``."""
+    first, *others = (
+        Image.fromarray(np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8))
+        for picture in pictures
+    )
+    stream = io.BytesIO()
+    first.save(stream, kind, append_images=others, **options)
+    return EncodedImage(stream.getvalue(), kind, first.width, first.height, caption)
 
 
 def put_text(

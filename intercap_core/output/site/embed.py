@@ -10,8 +10,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from intercap_core.flags import OF_OBJECT, PARTS, Flags
-
+PREVIEW = "preview.jpg"  # small picture in the folder of a sequence's page
 _TEMPLATES = Path(__file__).parent / "templates"
 _POLICY = (  # a page may load nothing but itself and pictures of the site
     "default-src 'none'; img-src 'self' file: data:; style-src 'unsafe-inline'; "
@@ -45,15 +44,6 @@ def tile(name: str, value: float | None, unit: str, note: str, digits: int = 1) 
     known = value is not None and np.isfinite(value)
     text = f"{value:.{digits}f}{'' if unit == '°' else ' '}{unit}".rstrip() if known else "–"
     return {"name": name, "value": text, "note": note}
-
-
-def flag_tile(flags: Flags, *, has_object: bool) -> dict[str, str]:
-    """Return the share of frames with a flag of the body, and in words those of other parts."""
-    shares = {part: 100 * share for part, share in flags.shares().items()}
-    others = ", ".join(
-        f"{part} {shares[part]:.0f} %" for part in PARTS[1:] if has_object or part not in OF_OBJECT
-    )
-    return tile("frames with unreliable body", shares["body"], "%", f"unreliable: {others}")
 
 
 def span(first: int, last: int) -> str:

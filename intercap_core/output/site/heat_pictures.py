@@ -10,15 +10,8 @@ from scipy.spatial import cKDTree
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.evaluation.summary import SurfaceHeat
-from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.output.site.drawing import (
-    ColouredMesh,
-    EncodedImage,
-    draw,
-    encode_png,
-    look_along,
-)
+from intercap_core.output.site import drawing
 
 # sRGB, from no contact to the map's maximum: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
@@ -34,7 +27,7 @@ def colours(values: np.ndarray, top: float) -> np.ndarray:
 
 def body_surfaces(
     model: BodyModel, likelihood: np.ndarray, common: float | None = None
-) -> list[tuple[str, list[EncodedImage], float]]:
+) -> list[tuple[str, list[drawing.EncodedImage], float]]:
     """Draw the body with lowered arms from both sides, and each hand from both sides.
 
     Returns name, pictures and highest likelihood of each surface. The last colour is that of the
@@ -78,7 +71,7 @@ def highest(likelihood: np.ndarray) -> float:
 
 def object_pictures(
     vertices: np.ndarray, faces: np.ndarray, heat: SurfaceHeat, top: float
-) -> list[EncodedImage]:
+) -> list[drawing.EncodedImage]:
     """Draw two opposite views of an object (V, 3), (F, 3) from above; its frame is z up.
 
     ``top``: likelihood of the last colour.
@@ -111,17 +104,16 @@ def _draw_from(
     up: np.ndarray,
     size: tuple[int, int],
     caption: str,
-) -> EncodedImage:
+) -> drawing.EncodedImage:
     """Draw the faces from far away; they fill a picture of ``size`` (width, height)."""
     backward = np.asarray(towards_viewer, np.float64)
     backward = backward / np.linalg.norm(backward)
-    turn = look_along(-backward, up)
+    turn = drawing.look_along(-backward, up)
     used = vertices[np.unique(faces)] @ turn.T
     low, high = used.min(0), used.max(0)
     middle, extent = (low + high) / 2, (high - low)[:2]
     distance = 40.0 * float(extent.max())  # nearly parallel rays
-    focal = 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1])
-    lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    lens = drawing.pinhole(*size, 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1]))
     pose = rigid(turn, np.array([0, 0, distance]) - middle)
-    picture = draw([ColouredMesh(vertices, faces, pose, colours=paint)], lens)
-    return encode_png(picture, caption)
+    picture = drawing.draw([drawing.ColouredMesh(vertices, faces, pose, colours=paint)], lens)
+    return drawing.encode_png(picture.rgba, caption)

@@ -14,7 +14,9 @@ from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.physics.rest_test import RELEASED_FRAMES
+from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import StatedError, held_out_cameras, stated_errors
+from intercap_core.flags import OF_OBJECT, PARTS
 from intercap_core.output.site import charts
 from intercap_core.output.site.embed import tile
 from intercap_core.stage_list import ESTIMATES
@@ -45,25 +47,13 @@ _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
     ("rest_jitter_mm", "jitter while the object rests, mm", 2, False),
     ("rest_jitter_deg", "jitter of the rotation while the object rests, degrees", 2, False),
     ("motion_onset_frames", "start of motion, absolute error, frames", 1, False),
-    (
-        "motion_onset_late_frames",
-        "start of motion, signed error (late is positive), frames",
-        1,
-        None,
-    ),
-    (
-        "joint_normalised_median",
-        "error over its standard deviation, joints (calibrated: 1)",
-        2,
-        None,
-    ),
-    (
-        "object_normalised_median",
-        "error over its standard deviation, object (calibrated: 1)",
-        2,
-        None,
-    ),
-)
+    ("motion_onset_late_frames",
+     "start of motion, signed error (late is positive), frames", 1, None),
+    ("joint_normalised_median",
+     "error over its standard deviation, joints (calibrated: 1)", 2, None),
+    ("object_normalised_median",
+     "error over its standard deviation, object (calibrated: 1)", 2, None),
+)  # fmt: skip
 
 
 def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
@@ -78,32 +68,24 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
         known_values = [v for v in values if v is not None]
         if not known_values:
             continue
-        best = None
-        if len(known_values) > 1 and more is not None:
-            best = max(known_values) if more else min(known_values)
         printed = ["" if v is None else f"{v:.{digits}f}" for v in values]
-        tied = len({text for text in printed if text}) == 1
-        rows.append(
-            {
-                "name": name,
-                "cells": [
-                    {"text": text, "best": v is not None and v == best and not tied}
-                    for text, v in zip(printed, values, strict=True)
-                ],
-            }
-        )
+        best = None
+        if more is not None and len({*printed} - {""}) > 1:
+            best = max(known_values) if more else min(known_values)
+        is_best = [v is not None and v == best for v in values]
+        rows.append((name, list(zip(printed, is_best, strict=True))))
     depth = figures.pooled(known, "truth/penetration_mean")
     touching = figures.pooled(known, "truth/contact_frame")
-    depth_mm = float("nan")
+    own = None
     if depth is not None and touching is not None and touching.any():
-        depth_mm = 1e3 * float(depth[touching].mean())
+        own = 1e3 * float(depth[touching].mean())
     return {
         "sequences": len(known),
         "frames": sum(len(s) for s in known),
         "stages": [_NAMES[stage] for stage in ESTIMATES],
         "rows": rows,
         "flags": figures.flag_figures(known),
-        "own_penetration": depth_mm,
+        "own_penetration": own,
         "sweep": _sweep(known),
         "reliability": _reliability(known),
     }
@@ -119,14 +101,8 @@ def _sweep(known: Sequence[SequenceMetrics]) -> str:
             lines.append(charts.Series(_NAMES[stage], colour, x, y))
     if not lines:
         return ""
-    return charts.line_chart(
-        lines,
-        x_label="threshold, mm",
-        y_label="F1 of body vertices",
-        x_range=(0, 30),
-        y_range=(0, 1),
-        marks=((4.5, "4.5 mm"),),
-    )
+    axes = ("threshold, mm", 0, 30), ("F1 of body vertices", 0, 1)
+    return charts.line_chart(lines, *axes, marks=((4.5, "4.5 mm"),))
 
 
 def _reliability(known: Sequence[SequenceMetrics]) -> str:
@@ -134,16 +110,12 @@ def _reliability(known: Sequence[SequenceMetrics]) -> str:
     table = contact_figures.contact_reliability(known)
     if table is None or len(table.count) < 2:
         return ""
-    return charts.line_chart(
-        [
-            charts.Series("joint", "c1", table.stated, table.true),
-            charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
-        ],
-        x_label="estimated probability of contact",
-        y_label="share of true contact",
-        x_range=(0, 1),
-        y_range=(0, 1),
-    )
+    lines = [
+        charts.Series("joint", "c1", table.stated, table.true),
+        charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
+    ]
+    axes = ("estimated probability of contact", 0, 1), ("share of true contact", 0, 1)
+    return charts.line_chart(lines, *axes)
 
 
 def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
@@ -165,69 +137,73 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
         grid = np.linspace(0, deepest, 121)
         share = np.array([(depth <= g).mean() if len(depth) else 0.0 for g in grid])
         shares.append(charts.Series(name, colour, grid, 100 * share))
-    x_range = (0.0, deepest)
-    summary = figures.penetration_figures(sequences)
     return {
-        **summary,
+        **figures.penetration_figures(sequences),
         "frames": int(touching.sum()),
         "bin": f"{bin_mm:g}",
         "histogram": charts.line_chart(
             lines,
-            x_label="penetration depth, mm (last bin: all larger)",
-            y_label="contact frames",
-            x_range=x_range,
-            y_range=(0, 1.08 * tallest),
+            ("penetration depth, mm (last bin: all larger)", 0, deepest),
+            ("contact frames", 0, 1.08 * tallest),
         ),
         "cumulative": charts.line_chart(
             shares,
-            x_label="penetration depth, mm",
-            y_label="contact frames, %",
-            x_range=x_range,
-            y_range=(0, 100),
+            ("penetration depth, mm", 0, deepest),
+            ("contact frames, %", 0, 100),
             marks=((5, "5"), (7, "7"), (20, "20")),
         ),
     }
 
 
-def physics_tile(sequences: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
-    """Return the tile of the rest test; none if no object was released."""
-    found = physics_figures(sequences)
-    if "displacement_mm" not in found:
-        return []
-    note = (
-        f"mean over {found['releases']:.0f} releases at rest, {RELEASED_FRAMES} simulated frames; "
-        f"unsupported in {100 * found['unsupported_share']:.0f} % of the frames"
+def quality_tiles(sequences: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
+    """Return the tiles of penetration, rest test, distances to the point clouds, and flags.
+
+    Tiles of the object are omitted without an object.
+    """
+    parts, tiles = ["body"], []
+    if any(s.has_object for s in sequences):
+        parts.append("object")
+        depth = figures.penetration_figures(sequences).get("mean_mm")
+        tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
+    released = physics_figures(sequences)
+    if "displacement_mm" in released:
+        note = (
+            f"mean over {released['releases']:.0f} releases at rest, {RELEASED_FRAMES} simulated "
+            f"frames; unsupported in {100 * released['unsupported_share']:.0f} % of the frames"
+        )
+        tiles.append(tile("object moves when released", released["displacement_mm"], "mm", note))
+    cloud = figures.cloud_figures(sequences)
+    for part in parts:
+        distance = cloud[f"{part}_visible_mm"]
+        tiles.append(tile(f"{part} to point cloud", distance, "mm", "visible surface"))
+    shares = {part: 100 * share for part, share in figures.pooled_flags(sequences).shares().items()}
+    others = ", ".join(
+        f"{part} {shares[part]:.0f} %"
+        for part in PARTS[1:]
+        if "object" in parts or part not in OF_OBJECT
     )
-    return [tile("object moves when released", found["displacement_mm"], "mm", note)]
+    note = f"unreliable: {others}"
+    return [*tiles, tile("frames with unreliable body", shares["body"], "%", note)]
 
 
 def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
     """Plot the cumulative distribution of accelerations; "" if there are none."""
-    lines = []
-    for name, colour, key in (
-        ("body", "c1", "acceleration_body"),
-        ("object", "c2", "acceleration_object"),
-    ):
-        values = figures.pooled(sequences, key)
+    sorted_mm = {}
+    for name in ("body", "object"):
+        values = figures.pooled(sequences, f"acceleration_{name}")
         known = np.zeros(0) if values is None else 1e3 * values[np.isfinite(values)]
         if len(known):
-            lines.append((name, colour, np.sort(known.astype(np.float64))))
-    if not lines:
+            sorted_mm[name] = np.sort(known.astype(np.float64))
+    if not sorted_mm:
         return ""
-    top = max(5.0, max(float(np.quantile(v, 0.99)) for _, _, v in lines))
+    top = max(5.0, *(float(np.quantile(values, 0.99)) for values in sorted_mm.values()))
     grid = np.linspace(0, top, 121)
-    return charts.line_chart(
-        [
-            charts.Series(
-                name, colour, grid, 100 * np.searchsorted(values, grid, "right") / len(values)
-            )
-            for name, colour, values in lines
-        ],
-        x_label="acceleration, mm/frame² at 30 fps",
-        y_label="frames, %",
-        x_range=(0.0, top),
-        y_range=(0.0, 100.0),
-    )
+    lines = []
+    for name, known in sorted_mm.items():
+        share = 100 * np.searchsorted(known, grid, "right") / len(known)
+        lines.append(charts.Series(name, {"body": "c1", "object": "c2"}[name], grid, share))
+    axes = ("acceleration, mm/frame² at 30 fps", 0, top), ("frames, %", 0, 100)
+    return charts.line_chart(lines, *axes)
 
 
 def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:
@@ -279,7 +255,7 @@ def cameras(
     note = "Worst first." if len(rows) > 3 else ""
     if len(rows) > _MAX_CAMERA_ROWS:
         note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
-    bars = [charts.BarPair.change(*row, "", False) for row in rows[:_MAX_CAMERA_ROWS]]
+    bars = [charts.BarPair.change(*row) for row in rows[:_MAX_CAMERA_ROWS]]
     return {
         "chart": charts.bar_pairs(bars, "residual, mm") if bars else "",
         "note": note,
@@ -308,7 +284,15 @@ def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, 
     return {
         "parts": parts,
         "truth": any(s.has_truth for s in judged),
-        "rows": [_row(s.name, parts, errors) for s, errors in by_sequence],
+        "rows": [
+            {
+                "sequence": s.name,
+                "errors": [next((e for e in errors if e.part == part), None) for part in parts],
+                "silent": "; ".join(dict.fromkeys(e.silent for e in errors if e.silent)),
+            }
+            for s, errors in by_sequence
+        ],
+        "range": error_range,
         "views": [{"name": name, "unit": unit} for name, unit, _ in _VIEWS],
         "cameras": [
             {
@@ -338,26 +322,25 @@ def covered(sequences: Sequence[SequenceMetrics]) -> list[tuple[str, int, int]]:
     return [(part, sum(inside), len(inside)) for part, inside in known.items()]
 
 
-def _row(name: str, parts: Sequence[str], errors: Sequence[StatedError]) -> dict[str, Any]:
-    by_part = {e.part: e for e in errors}
-    silent = list(dict.fromkeys(e.silent for e in errors if e.silent))
-    return {
-        "sequence": name,
-        "cells": [_cell(by_part.get(part)) for part in parts],
-        "silent": "; ".join(silent),
-    }
-
-
-def _cell(error: StatedError | None) -> dict[str, Any]:
-    if error is None:
-        return {"stated": None, "range": "", "true": None, "repeated": None, "outside": False}
-    known = {"true": error.true, "repeated": error.repeated}
-    if not np.isfinite(error.stated):
-        return {"stated": None, "range": "", "outside": False, **known}
-    outside = bool(np.isfinite(error.true)) and not error.covers
-    return {"stated": error.stated, "range": error_range(error), "outside": outside, **known}
-
-
 def error_range(error: StatedError) -> str:
-    """Format the range of an estimated error, millimetres."""
+    """Format the range of an estimated error, millimetres; a dash if none is stated."""
+    if not np.isfinite(error.stated):
+        return "–"
     return f"{error.stated / error.factor:.1f}–{error.stated * error.factor:.1f}"
+
+
+def made_by_stage(
+    summaries: Sequence[SequenceSummary],
+) -> dict[str, list[tuple[int, str, list[str]]]]:
+    """Return schema version, digest of settings and names of sequences by stage, most names first.
+
+    Several entries of a stage are a mixture.
+    """
+    made: dict[str, dict[tuple[int, str], list[str]]] = {}
+    for s in summaries:
+        for stage, version in s.made_by.items():
+            made.setdefault(stage, {}).setdefault(version, []).append(s.name)
+    return {
+        stage: sorted(((*key, names) for key, names in by.items()), key=lambda e: -len(e[2]))
+        for stage, by in made.items()
+    }

@@ -1,4 +1,4 @@
-"""Body and object drawn over the recorded images of a sequence."""
+"""Body and object drawn over the recorded images of a sequence: pictures, and a short animation."""
 
 from __future__ import annotations
 
@@ -9,43 +9,41 @@ import cv2
 import numpy as np
 import torch
 
-from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import BodyParameters
+from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
-from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_jpeg
+from intercap_core.output.site import drawing
+from intercap_core.output.viewer.content import Fit
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)
+_PICTURES = 24  # of the animation
+_ROWS, _THUMBNAIL_ROWS = 340, 144  # largest heights, pixels
 
 
 @dataclass(frozen=True, eq=False)
-class PosedFit:
-    """The joint result of one sequence over T frames, master frame, metres."""
+class PosedFit(Fit):
+    """The joint result of one sequence, with its object."""
 
-    model: BodyModel
-    parameters: BodyParameters
-    rotation: np.ndarray
-    """(T, 3, 3) master_from_object."""
-    translation: np.ndarray
-    """(T, 3) master_from_object."""
     mesh: ObjectMesh | None
     """None without an object."""
 
-    def at(self, t: int) -> list[ColouredMesh]:
+    def at(self, t: int) -> list[drawing.ColouredMesh]:
         """Return body and, if there is one, object in a frame, in the master camera's frame."""
         with torch.no_grad():
             posed = self.model.forward(self.parameters.frames(slice(t, t + 1)))
         body = posed.vertices[0].numpy().astype(np.float64)
         faces = self.model.faces.numpy()
-        meshes = [ColouredMesh(body, faces, np.eye(4), colours=BODY_COLOUR)]
+        meshes = [drawing.ColouredMesh(body, faces, np.eye(4), colours=BODY_COLOUR)]
         if self.mesh is not None:
             pose = rigid(self.rotation[t], self.translation[t])
             mesh = self.mesh
-            meshes.append(ColouredMesh(mesh.vertices, mesh.faces, pose, colours=OBJECT_COLOUR))
+            meshes.append(
+                drawing.ColouredMesh(mesh.vertices, mesh.faces, pose, colours=OBJECT_COLOUR)
+            )
         return meshes
 
 
@@ -90,7 +88,7 @@ def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -
 
 def overlays(
     images: Frames, rig: Rig, fit: PosedFit, cameras: Sequence[int], frames: Sequence[int]
-) -> dict[str, dict[int, EncodedImage]]:
+) -> dict[str, dict[int, drawing.EncodedImage]]:
     """Draw the fit over images; return them by name of the camera and frame, without missing ones.
 
     Args:
@@ -99,17 +97,63 @@ def overlays(
     posed = {t: fit.at(t) for t in frames}
     drawn = {rig[c].name: draw_over(images, rig, c, posed, rows=420) for c in cameras}
     return {
-        camera: {t: encode_jpeg(picture) for t, picture in pictures.items()}
+        camera: {t: drawing.encode_jpeg(picture) for t, picture in pictures.items()}
         for camera, pictures in drawn.items()
         if pictures
     }
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Pictures of a sequence: the result over the images of one camera."""
+
+    animation: drawing.EncodedImage
+    """The whole sequence in ``_PICTURES`` evenly spread frames, in real time."""
+    still: drawing.EncodedImage
+    """A frame of it, for readers who prefer no motion."""
+    thumbnail: drawing.EncodedImage
+    """The same frame, small, cropped to body and object."""
+
+
+def middle_of_contact(measured: SequenceMetrics) -> int:
+    """Return the middle of the contact frames, or of the sequence if nothing is in contact."""
+    frames = list(range(len(measured)))
+    if measured.has_object and measured.values["contact_frame"].any():
+        frames = np.flatnonzero(measured.values["contact_frame"]).tolist()
+    return frames[len(frames) // 2]
+
+
+def make_preview(
+    images: Frames, rig: Rig, c: int, fit: PosedFit, measured: SequenceMetrics
+) -> Preview | None:
+    """Draw the preview; None if camera ``c`` has no image that shows the fit.
+
+    The still shows :func:`middle_of_contact`.
+
+    Args:
+        images: images by the frame that they show (:meth:`Frames.showing`).
+    """
+    total, middle = len(measured), middle_of_contact(measured)
+    spread = np.linspace(0, total - 1, min(_PICTURES, total)).round().astype(int)
+    frames = sorted({middle, *spread.tolist()})
+    pictures = draw_over(images, rig, c, {t: fit.at(t) for t in frames}, rows=_ROWS)
+    if not pictures:
+        return None
+    nearest = min(pictures, key=lambda t: abs(t - middle))
+    small = draw_over(images, rig, c, {nearest: fit.at(nearest)}, rows=_THUMBNAIL_ROWS)
+    caption = f"Result over the images of camera {rig.names[c]}"
+    return Preview(
+        drawing.encode_animation(list(pictures.values()), total / measured.fps, caption),
+        drawing.encode_jpeg(pictures[nearest]),
+        drawing.encode_jpeg(small[nearest]),
+    )
 
 
 def draw_over(
     images: Frames,
     rig: Rig,
     c: int,
-    posed: Mapping[int, Sequence[ColouredMesh]],
+    posed: Mapping[int, Sequence[drawing.ColouredMesh]],
     *,
     rows: int,
     opacity: float = 0.62,
@@ -138,12 +182,14 @@ def draw_over(
             continue
         crop = image[y0 : y0 + height, x0 : x0 + width]
         crop = cv2.resize(crop, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        picture = draw([mesh.seen_by(camera) for mesh in meshes], lens)
+        picture = drawing.draw([mesh.seen_by(camera) for mesh in meshes], lens)
         pictures[t] = picture.over(crop[..., ::-1] / np.float32(255), opacity)
     return pictures
 
 
-def _window(camera: Camera, meshes: Sequence[ColouredMesh]) -> tuple[int, int, int, int] | None:
+def _window(
+    camera: Camera, meshes: Sequence[drawing.ColouredMesh]
+) -> tuple[int, int, int, int] | None:
     """Return x, y, width, height of the part of the image that shows all meshes with a margin.
 
     None if they are not in view.

@@ -16,9 +16,8 @@ from intercap_core.evaluation.verdict.figures import mean_stated
 from intercap_core.flags import PARTS
 from intercap_core.output.site import measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, flag_tile, render, span, tile
+from intercap_core.output.site.embed import PREVIEW, css, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
-from intercap_core.output.site.preview import PREVIEW
 from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
@@ -59,7 +58,6 @@ class Heat:
     top: float
     """Likelihood of the last colour."""
     frames: int
-    """Number of frames in the heatmap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,6 @@ class DatasetContent:
     surfaces: Sequence[Heat]
     """Heatmaps of the body and the hands."""
     objects: Sequence[Heat]
-    """Heatmaps of the objects."""
     body_frames: int
     """Frames of the body's heatmaps."""
     page_of: Mapping[str, str]
@@ -91,7 +88,6 @@ class DatasetContent:
 
 
 def page(content: DatasetContent) -> str:
-    """Return the HTML of the page."""
     measured = [s.metrics for s in content.sequences]
     rows = _rows(content)
     runs = [
@@ -105,7 +101,7 @@ def page(content: DatasetContent) -> str:
         for first, last, reason in flags.ranges(s.flags.texts())
     ]
     context = {
-        "dataset": content.dataset,
+        **vars(content),
         "headline": _headline(content, measured),
         "virtual": sum(s.has_truth for s in measured),
         "tiles": _tiles(measured),
@@ -115,7 +111,6 @@ def page(content: DatasetContent) -> str:
             name: sorted({row[name] for row in rows if row[name]})
             for name in ("subject", "object", "intent")
         },
-        "page_of": content.page_of,
         "failed": sorted(content.failed.items()),
         "remarks": sorted(content.remarks.items()),
         "counts": _counts(measured),
@@ -131,8 +126,7 @@ def page(content: DatasetContent) -> str:
         "flagged_left_out": max(0, len(runs) - _MAX_RUNS),
         "flagged_text": figures.pooled_flags(measured).summary(),
         "versions": versions(),
-        "changed": content.changed,
-        "made_by": _made_by(content.sequences),
+        "made_by": measures.made_by_stage(content.sequences),
     }
     return render("overview.html.j2", context)
 
@@ -158,54 +152,47 @@ def _headline(content: DatasetContent, measured: Sequence[SequenceMetrics]) -> s
 
 
 def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
-    depth = figures.penetration_figures(measured)
-    cloud = figures.cloud_figures(measured)
     tiles = []
     if any(s.has_truth for s in measured):
         joint = figures.truth_figures(measured, "joint")
-        for key, name, unit, note in (
-            ("body_pve_mm", "body error", "mm", "mean over vertices, against ground truth"),
-            ("object_translation_mm", "object error", "mm", "median of the centre"),
-            ("object_rotation_deg", "object rotation error", "°", "median"),
-            ("contact_region_f1", "contact, F1 by region", "", "of the body, against ground truth"),
-            ("contact_f1", "contact, F1 by vertex", "", "at 4.5 mm, against ground truth"),
-        ):
+        for key, name, unit, digits, note in (
+            ("body_pve_mm", "body error", "mm", 1, "mean over vertices, against ground truth"),
+            ("object_translation_mm", "object error", "mm", 1, "median of the centre"),
+            ("object_rotation_deg", "object rotation error", "°", 2, "median"),
+            (
+                "contact_region_f1", "contact, F1 by region", "", 2,
+                "of the body, against ground truth",
+            ),
+            ("contact_f1", "contact, F1 by vertex", "", 2, "at 4.5 mm, against ground truth"),
+        ):  # fmt: skip
             if key in joint:
-                worst = _worst_object(measured, key, unit) if key.startswith("object") else ""
-                tiles.append(
-                    tile(name, joint[key], unit, note + worst, 2 if unit in ("", "°") else 1)
-                )
+                worst, error = _worst_object(measured, key) if key.startswith("object") else ("", 0)
+                if worst:
+                    value = tile("", error, unit, "", digits)["value"]
+                    note += f"; worst: {worst}, {value if np.isfinite(error) else 'lost'}"
+                tiles.append(tile(name, joint[key], unit, note, digits))
     inside = {part: f"; {n} of {all_} true errors in range"
               for part, n, all_ in measures.covered(measured)}  # fmt: skip
     tiles += [
         tile(f"{part}, estimated error", value, "mm", f"without ground truth{inside.get(part, '')}")
         for part, value in mean_stated(measured).items()
     ]
-    handling = any(s.has_object for s in measured)
-    if handling:
-        tiles.append(tile("penetration", depth.get("mean_mm"), "mm", "mean over contact frames"))
-        tiles += measures.physics_tile(measured)
-    tiles.append(tile("body to point cloud", cloud["body_visible_mm"], "mm", "visible surface"))
-    if handling:
-        tiles.append(
-            tile("object to point cloud", cloud["object_visible_mm"], "mm", "visible surface")
-        )
-    return [*tiles, flag_tile(figures.pooled_flags(measured), has_object=handling)]
+    return tiles + measures.quality_tiles(measured)
 
 
-def _worst_object(measured: Sequence[SequenceMetrics], key: str, unit: str) -> str:
+def _worst_object(measured: Sequence[SequenceMetrics], key: str) -> tuple[str, float]:
     """Return name and value of the object with the largest error; "" if there is only one."""
     by_object: dict[str, list[SequenceMetrics]] = {}
     for s in measured:
         if s.has_truth and s.has_object:
             by_object.setdefault(s.object_, []).append(s)
-    errors = {name: figures.truth_figures(some, "joint").get(key, np.inf)
-              for name, some in by_object.items()}  # fmt: skip
-    if len(errors) < 2:
-        return ""
-    worst = max(errors, key=lambda name: errors[name])
-    value = f"{errors[worst]:.{2 if unit == '°' else 1}f}{'' if unit == '°' else ' '}{unit}"
-    return f"; worst: {worst}, {value if np.isfinite(errors[worst]) else 'lost'}"
+    if len(by_object) < 2:
+        return "", 0.0
+    errors = {
+        name: figures.truth_figures(some, "joint").get(key, np.inf)
+        for name, some in by_object.items()
+    }
+    return max(errors.items(), key=lambda item: item[1])
 
 
 def _rows(content: DatasetContent) -> list[dict[Hashable, Any]]:
@@ -246,8 +233,7 @@ def _printed(table: pd.DataFrame) -> dict[str, Any]:
     """Format the columns of interest: heads with units, and cells."""
     shown = [str(name) for name in table if "." not in str(name) or name in _FIGURES]
     cells = [
-        ["–" if _is_unknown(value) else _text(value) for value in row]
-        for row in table[shown].itertuples(index=False, name=None)
+        [_text(value) for value in row] for row in table[shown].itertuples(index=False, name=None)
     ]
     return {
         "heads": [_label(name) for name in shown],
@@ -266,11 +252,10 @@ def _label(column: str) -> tuple[str, str]:
     return column.replace("_", " "), ""
 
 
-def _is_unknown(value: object) -> bool:
-    return value is None or value == "" or (isinstance(value, float) and not np.isfinite(value))
-
-
 def _text(value: object) -> str:
+    """Format a cell; a dash if its value is unknown."""
+    if value is None or value == "" or (isinstance(value, float) and not np.isfinite(value)):
+        return "–"
     if not isinstance(value, float):
         return str(value)
     return f"{value:.2f}" if abs(value) < 1 else f"{value:.1f}"  # shares as well
@@ -287,25 +272,6 @@ def _heat(content: DatasetContent) -> dict[str, Any]:
         "surfaces": list(content.surfaces),
         "objects": list(content.objects),
     }
-
-
-def _made_by(sequences: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
-    """Count sequences by stage, schema version and settings. Several entries are a mixture."""
-    counted: dict[str, dict[str, list[str]]] = {}
-    for s in sequences:
-        for stage, (version, digest) in s.made_by.items():
-            made = f"v{version} {digest or '-'}"
-            counted.setdefault(stage, {}).setdefault(made, []).append(s.name)
-    return [
-        {
-            "stage": stage,
-            "made": [
-                {"digest": made, "count": len(names), "names": names}
-                for made, names in sorted(versions_.items(), key=lambda pair: -len(pair[1]))
-            ],
-        }
-        for stage, versions_ in counted.items()
-    ]
 
 
 def _counted(count: int, noun: str) -> str:

@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.clouds import colour_lookup
+from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import apply, rigid
-from intercap_core.output.site.drawing import look_along
+from intercap_core.geometry.camera.transforms import apply
+from intercap_core.output.site.drawing import look_at
 
 _BEHIND_M = 0.03  # a pixel covers neighbours that are more than this farther away
 # Row and column offsets of a pixel's neighbours
@@ -57,32 +59,19 @@ class FusedCloud:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A pinhole camera (x right, y down, z forward) and its image size."""
+    """A camera without distortion (x right, y down, z forward) and its pose."""
 
     view_from_world: np.ndarray
     """(4, 4) transform to the camera's frame."""
-    focal: float
-    """Focal length, pixels."""
-    width: int
-    height: int
+    lens: Intrinsics
 
     @classmethod
     def towards(
-        cls,
-        target: np.ndarray,
-        azimuth: float,
-        elevation: float,
-        distance: float,
-        focal: float,
-        size: tuple[int, int],
+        cls, target: np.ndarray, azimuth: float, elevation: float, distance: float, lens: Intrinsics
     ) -> Viewpoint:
         """Look at ``target`` (3,), z up, from ``distance`` metres; angles in radians."""
-        away = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
-             np.sin(elevation)]
-        )  # fmt: skip
-        turn = look_along(-away, np.array([0.0, 0.0, 1.0]))
-        return cls(rigid(turn, -turn @ (target + distance * away)), focal, *size)
+        away = Rotation.from_euler("ZY", [azimuth, -elevation]).as_matrix()[:, 0]
+        return cls(look_at(target, -away, np.array([0.0, 0.0, 1.0]), distance), lens)
 
     @property
     def eye(self) -> np.ndarray:
@@ -93,14 +82,14 @@ class Viewpoint:
         """Return pixels (N, 2) and depths (N,) of points (N, 3); pixel centres are integers."""
         local = apply(self.view_from_world, points)
         z = local[:, 2]
-        middle = np.array([(self.width - 1) / 2, (self.height - 1) / 2], points.dtype)
+        middle = np.array([self.lens.cx, self.lens.cy], points.dtype)
         safe = np.where(z > 1e-6, z, 1)
-        return local[:, :2] * (points.dtype.type(self.focal) / safe[:, None]) + middle, z
+        return local[:, :2] * (points.dtype.type(self.lens.fx) / safe[:, None]) + middle, z
 
     def contains(self, points: np.ndarray, border: float) -> bool:
         """Return whether all points (N, 3) are at least ``border`` pixels inside the image."""
         at, z = self.project(points)
-        high = np.array([self.width, self.height]) - border
+        high = np.array([self.lens.width, self.lens.height]) - border
         return bool((z > 0).all() and (at > border).all() and (at < high).all())
 
 
@@ -127,15 +116,14 @@ def fuse(
     Args:
         bias: (C,) metres, subtracted from each camera's depth.
     """
-    points, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-    colours, cameras = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int32)]
+    nothing = np.zeros((0, 3), np.float32)
+    parts = [(nothing, nothing, nothing, np.zeros(0, np.int32))]
     for own in measured:
         pose = world_from_master @ rig[own.c].master_from_depth
-        points.append(apply(pose, own.points - np.float32(bias[own.c]) * own.rays))
-        normals.append(own.normals @ pose[:3, :3].T.astype(np.float32))
-        colours.append(own.colours)
-        cameras.append(np.full(len(own.points), own.c, np.int32))
-    return FusedCloud(*(np.concatenate(part) for part in (points, normals, colours, cameras)))
+        points = apply(pose, own.points - np.float32(bias[own.c]) * own.rays)
+        normals = own.normals @ pose[:3, :3].T.astype(np.float32)
+        parts.append((points, normals, own.colours, np.full(len(points), own.c, np.int32)))
+    return FusedCloud(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
@@ -148,10 +136,11 @@ def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     to_viewer = view.eye.astype(np.float32) - cloud.points
     facing = np.flatnonzero(np.einsum("ij,ij->i", to_viewer, cloud.normals) > 0)
     at, z = view.project(cloud.points[facing])
+    width, height = view.lens.width, view.lens.height
     column, row = np.rint(at[:, 0]).astype(np.int64), np.rint(at[:, 1]).astype(np.int64)
-    inside = (z > 0.1) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
-    pixel, z = (row * view.width + column)[inside], z[inside]
-    count = view.width * view.height
+    inside = (z > 0.1) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixel, z = (row * width + column)[inside], z[inside]
+    count = width * height
     nearest = np.full(count, np.inf, np.float32)
     np.minimum.at(nearest, pixel, z)
     front = z < nearest[pixel] + 0.015
@@ -160,7 +149,7 @@ def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     picture = np.empty((count, 3), np.float32)
     for channel in range(3):
         picture[:, channel] = np.bincount(pixel, colours[:, channel], count) / weight
-    source, depth = _spread(nearest.reshape(view.height, view.width))
+    source, depth = _spread(nearest.reshape(height, width))
     return picture[source], depth
 
 

@@ -6,16 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.output.site import embed
-from intercap_core.output.site.drawing import (
-    ColouredMesh,
-    EncodedImage,
-    draw,
-    encode_jpeg,
-    look_along,
-)
+from intercap_core.output.site import drawing, embed
 from intercap_core.scan.result import ScannedMesh
 
 _SIZE = 320  # px of a picture
@@ -45,15 +36,15 @@ def scan_page(name: str, sequences: Sequence[str], mesh: ScannedMesh) -> str:
     )
 
 
-def _picture(mesh: ScannedMesh, colours: np.ndarray, side: str) -> EncodedImage:
+def _picture(mesh: ScannedMesh, colours: np.ndarray, side: str) -> drawing.EncodedImage:
     """Picture of the mesh from one side; ``colours``: (V, 3) RGB in 0..1."""
     away = np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * 2.5
     direction = np.array(_SIDES[side], float)
     up = np.array([0.0, 1, 0]) if direction[2] else np.array([0.0, 0, 1])
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    rotation = look_along(direction, up)
-    pose = rigid(rotation, -rotation @ (middle - away * direction))
-    focal, centre = 2.2 * _SIZE, (_SIZE - 1) / 2
-    lens = Intrinsics(_SIZE, _SIZE, focal, focal, centre, centre)
-    drawn = draw([ColouredMesh(mesh.vertices, mesh.faces, pose, colours=colours)], lens)
-    return encode_jpeg(drawn.over(np.ones((_SIZE, _SIZE, 3))), side)
+    pose = drawing.look_at(middle, direction, up, away)
+    lens = drawing.pinhole(_SIZE, _SIZE, 2.2 * _SIZE)
+    drawn = drawing.draw(
+        [drawing.ColouredMesh(mesh.vertices, mesh.faces, pose, colours=colours)], lens
+    )
+    return drawing.encode_jpeg(drawn.over(np.ones((_SIZE, _SIZE, 3))), side)

@@ -15,12 +15,11 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.physics.carriers import Carrier
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.flags import OF_OBJECT, PARTS
-from intercap_core.geometry.solve.time_series import runs
+from intercap_core.geometry.solve import time_series
 from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
-from intercap_core.output.site.embed import css, flag_tile, render, span, tile
-from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
-from intercap_core.output.site.preview import Preview
+from intercap_core.output.site.embed import css, render, span, tile
+from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Preview
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
@@ -40,26 +39,20 @@ class SequenceContent:
     note: str
     """Why there are no overlays."""
     joint: str
-    """Summary of the joint fit."""
     energies: Sequence[tuple[str, float, float]]
     """Name of each energy term with its values before and after the joint fit."""
     closeups: Sequence[EncodedImage]
     capture: dict[str, Any]
-    """Variables of the section on the capture."""
     track: dict[str, Any] | None
     """Variables of the section on the track, None without an object."""
     body: dict[str, Any]
-    """Variables of the section on the body."""
     annotated: Sequence[ContactInterval] | None
-    """Annotated contact."""
     made_by: Mapping[str, str]
     """Schema version and digest of settings by stage."""
     body_file: str
-    """File name of the body file."""
 
 
 def page(content: SequenceContent) -> str:
-    """Return the HTML of the page."""
     s = content.metrics
     flagged = s.flags.texts()
     cameras = [
@@ -74,10 +67,10 @@ def page(content: SequenceContent) -> str:
         for camera, pictures in content.overlays.items()
     ]
     context = {
+        **vars(content),
         "name": s.name,
         "subject": s.subject,
         "object": s.object_,
-        "intent": content.intent,
         "frames": len(s),
         "fps": s.fps,
         "tiles": _tiles(s),
@@ -87,21 +80,16 @@ def page(content: SequenceContent) -> str:
         "verdict": measures.verdict([s], {s.name}),
         "truth": measures.truth([s]),
         "flagged_runs": [
-            {"frames": span(first, last), "reason": reason}
-            for first, last, reason in flags.ranges(flagged)
+            (span(first, last), reason) for first, last, reason in flags.ranges(flagged)
         ],
         "flagged_text": s.flags.summary(),
         "energies": _energies(content.energies),
-        "joint": content.joint,
         "physics_note": s.physics_note,
         "cameras": cameras,
-        "note": content.note,
-        "preview": content.preview,
-        "closeups": content.closeups,
-        "capture": content.capture,
-        "track": content.track,
-        "body": content.body,
-        "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
+        "colours": [
+            ("body", css(BODY_COLOUR)),
+            *([("object", css(OBJECT_COLOUR))] if s.object_ else []),
+        ],
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
         "policy": viewer.POLICY,
@@ -129,18 +117,10 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
         if s.has_object:
             centre = errors.get("object_translation_mm")
             tiles.append(tile("object error", centre, "mm", "centre, median, against ground truth"))
-    cloud = figures.cloud_figures([s])
-    tiles.append(tile("body to point cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if s.has_object:
-        tiles.append(
-            tile("object to point cloud", cloud["object_visible_mm"], "mm", "visible surface")
-        )
-        depth = figures.penetration_figures([s]).get("mean_mm")
-        tiles.append(tile("penetration", depth, "mm", "mean over contact frames"))
-        tiles += measures.physics_tile([s])
         share = 100 * float(s.values["contact_frame"].mean())
         tiles.append(tile("in contact", share, "%", "of the frames", 0))
-    return [*tiles, flag_tile(s.flags, has_object=s.has_object)]
+    return tiles + measures.quality_tiles([s])
 
 
 def _rows(
@@ -149,16 +129,15 @@ def _rows(
     """Return rows for flags, frames in contact, and contact of each region by source."""
     rows = []
     for part in PARTS:
-        found = flags.ranges(s.flags.reasons_of(part))
-        marks = [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in found]
         if s.has_object or part not in OF_OBJECT:
+            found = flags.ranges(s.flags.reasons_of(part))
+            marks = [(a, b, "fill flag", why) for a, b, why in found]
             rows.append(charts.TimelineRow(f"flagged, {part}", marks))
     annotated_runs: dict[str, list[tuple[int, int, str, str]]] = {}
     for interval in annotated or ():
         last = min(interval.end, len(s)) - 1
         if last >= interval.start:
-            title = f"{span(interval.start, last)}: annotated"
-            run = (interval.start, last, "fill annotated", title)
+            run = (interval.start, last, "fill annotated", "annotated")
             annotated_runs.setdefault(interval.part, []).append(run)
     if not s.has_object:
         return rows
@@ -167,7 +146,7 @@ def _rows(
         carriers = [str(name) for name in s.values["physics/carrier"]]
         bad = (Carrier.UNSUPPORTED, Carrier.UNKNOWN)
         runs = [
-            (a, b, "fill flag" if name in bad else "fill any", f"{span(a, b)}: {name}")
+            (a, b, "fill flag" if name in bad else "fill any", name)
             for a, b, name in flags.ranges(carriers)
         ]
         rows.append(charts.TimelineRow("carried by", runs))
@@ -182,8 +161,8 @@ def _rows(
         touching = s.values["region_contact"][:, names.index(region)]
         if (stated >= 0.5).any() or touching.any() or region in annotated_runs:
             runs = [
-                (a, b, "hover", f"{span(a, b)}: {100 * stated[a : b + 1].mean():.0f} %")
-                for a, b, _, _ in _runs(stated >= 0.5)
+                (a, b, "hover", f"{100 * stated[a : b + 1].mean():.0f} %")
+                for a, b in time_series.runs(stated >= 0.5)
             ]
             rows.append(charts.TimelineRow(f"{label}, estimated", runs, levels=stated))
         if touching.any():
@@ -193,61 +172,44 @@ def _rows(
 
 def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
     """Return charts over the frames with their captions."""
-    residuals = [
-        _over_frames(
-            s,
-            (
-                ("body to point cloud", "c1", "body_visible_to_cloud"),
-                ("object to point cloud", "c2", "object_visible_to_cloud"),
-                ("penetration", "c3", "penetration_mean"),
-            ),
+    values = s.values
+    stated = zip(
+        values.get("verdict/part_names", ()), ("c1", "c3", "c2"),
+        values.get("verdict/error_frame", ()), strict=False,
+    )  # fmt: skip
+    plots = []
+    for lines, unit, caption in (
+        (
+            [
+                ("body to point cloud", "c1", values.get("body_visible_to_cloud")),
+                ("object to point cloud", "c2", values.get("object_visible_to_cloud")),
+                ("penetration", "c3", values.get("penetration_mean")),
+            ],
             "distance, mm",
             "Distance of visible surfaces to the point clouds; depth of the body in the object.",
         ),
-        _over_frames(
-            s,
-            (("body", "c1", "acceleration_body"), ("object", "c2", "acceleration_object")),
+        (
+            [
+                ("body", "c1", values.get("acceleration_body")),
+                ("object", "c2", values.get("acceleration_object")),
+            ],
             "acceleration, mm/frame²",
             "Second differences at 30 frames per second, which show jitter.",
         ),
-    ]
-    if "verdict/error_frame" in s.values:
-        parts = zip(s.values["verdict/part_names"], ("c1", "c3", "c2"), strict=False)
-        lines = [
-            (str(part), colour, 1e3 * s.values["verdict/error_frame"][p].astype(np.float64))
-            for p, (part, colour) in enumerate(parts)
+        (
+            list(stated),
+            "estimated error, mm",
+            "Estimated error (no ground truth) by frame; no line where there is no estimate.",
+        ),
+    ):
+        series = [
+            charts.Series(name, colour, np.arange(len(s)), 1e3 * metres.astype(np.float64))
+            for name, colour, metres in lines
+            if metres is not None and np.isfinite(metres).any()
         ]
-        caption = "Estimated error (no ground truth) by frame; no line where there is no estimate."
-        residuals.append(_chart(lines, "estimated error, mm", caption))
-    return [pair for pair in residuals if pair is not None]
-
-
-def _over_frames(
-    s: SequenceMetrics, lines: Sequence[tuple[str, str, str]], unit: str, caption: str
-) -> tuple[str, str] | None:
-    return _chart(
-        [(n, colour, 1e3 * s.values[key].astype(np.float64)) for n, colour, key in lines
-         if key in s.values],
-        unit,
-        caption,
-    )  # fmt: skip
-
-
-def _chart(
-    lines: Sequence[tuple[str, str, np.ndarray]], unit: str, caption: str
-) -> tuple[str, str] | None:
-    """Plot lines (name, colour, values (T,)) over the frames; None if no value is finite."""
-    series = []
-    for name, colour, values in lines:
-        known = np.flatnonzero(np.isfinite(values))
-        # a line for each run of known frames; only the first has a name in the legend
-        for first, last in runs(np.isfinite(values)):
-            run = np.arange(first, last + 1)
-            label = name if first == known[0] else ""
-            series.append(charts.Series(label, colour, run, values[run]))
-    if not series:
-        return None
-    return charts.frame_chart(series, len(lines[0][2]), unit), caption
+        if series:
+            plots.append((charts.frame_chart(series, len(s), unit), caption))
+    return plots
 
 
 def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
@@ -257,9 +219,7 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
     total = max(sum(before for _, before, _ in terms), 1e-12)
     return charts.bar_pairs(
         [
-            charts.BarPair.change(
-                name.replace("_", " "), 100 * before / total, 100 * after / total, "", False
-            )
+            charts.BarPair.change(name.replace("_", " "), 100 * before / total, 100 * after / total)
             for name, before, after in terms
             if max(before, after) > 0
         ],
@@ -269,4 +229,4 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str, str]]:
     """Return the runs of set frames (T,) for a row of the timeline."""
-    return [(first, last, "fill any", span(first, last)) for first, last in runs(mask)]
+    return [(first, last, "fill any", "") for first, last in time_series.runs(mask)]

@@ -255,13 +255,13 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
         for place, part in enumerate(s.values.get("verdict/part_names", ())):
             columns[f"verdict.{part}_mm"] = 1e3 * s.values["verdict/error_frame"][place]
         for stage in ESTIMATES:
-            for name in ("body_pve", "body_mpjpe", "object_translation"):
+            for name, unit, factor in (
+                ("body_pve", "mm", 1e3), ("body_mpjpe", "mm", 1e3),
+                ("object_translation", "mm", 1e3), ("object_rotation", "deg", 1.0),
+            ):  # fmt: skip
                 if f"truth/{stage}/{name}" in s.values:
                     values = s.values[f"truth/{stage}/{name}"].astype(np.float64)
-                    columns[f"{stage}.{name}_mm"] = 1e3 * values
-            if f"truth/{stage}/object_rotation" in s.values:
-                degrees = s.values[f"truth/{stage}/object_rotation"].astype(np.float64)
-                columns[f"{stage}.object_rotation_deg"] = degrees
+                    columns[f"{stage}.{name}_{unit}"] = factor * values
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
 

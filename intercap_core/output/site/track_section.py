@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import finite_median
-from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.masks import Runs
-from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render
 from intercap_core.object_track.artefact import SOURCE_NONE as NO_TRACK
 from intercap_core.output.site import charts
-from intercap_core.output.site.drawing import EncodedImage, SquareCrop, make_sheet
+from intercap_core.output.site.embed import css
+from intercap_core.output.site.fit_section import SquareCrop, draw_sheet, view_row
 from intercap_core.output.site.overlays import choose_frames
-from intercap_core.schemas import OBJECT_TRACK, SCENE
+from intercap_core.schemas import OBJECT_TRACK
 from intercap_core.sequence_inputs import SequencePaths
 
 GOOD_OVERLAP = 0.7  # smallest IoU of a view that agrees
@@ -42,7 +41,7 @@ TRACK_STATES = {
 def read_track(
     paths: SequencePaths, mesh: ObjectMesh, kept: Callable[[int, int], bytes]
 ) -> dict[str, Any]:
-    """Read and draw one track; return the variables of the template track.html.j2.
+    """Read and draw one track; return the variables of the template fit.html.j2.
 
     Args:
         kept: returns the RLE of the candidate that the track uses in frame t and camera c, b"" if
@@ -52,26 +51,37 @@ def read_track(
     Raises UserError as :func:`artefacts.read` does.
     """
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
-        poses = np.array(
-            [rigid(r, t) for r, t in zip(track["rotation"], track["translation"], strict=True)]
-        )
-        name, source = str(track.attributes["sequence"]), track.attributes["seed_source"]
+        poses = rigid(track["rotation"], track["translation"])
+        source = track.attributes["seed_source"]
         sheet, note = None, str(track.attributes["doubts"])
         seed = "none: the object was found in no frame"
         if source != NO_TRACK:
-            sheet, note = _sheet(name, paths, mesh, poses, kept, track["overlap"])
+
+            def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
+                return _cell(camera, rgb, mesh, poses[t], kept(t, c))
+
+            shown = choose_frames(1 - _mean(track["overlap"], 1), 5)
+            sheet, note = draw_sheet(paths, shown, _CELL_PX, draw)
             origin = "annotated" if source == "annotated" else "found by search"
             seed = f"frame {track.attributes['seed_frame']}, {origin}"
         covariance = track["covariance"]
         sigma_mm = 1e3 * _largest(covariance[:, 3:, 3:])
         sigma_deg = np.degrees(_largest(covariance[:, :3, :3]))
         return {
-            "name": name,
+            "of": "object's track",
             "object": str(track.attributes["object"]),
             "seed": seed,
             "sheet": sheet,
             "note": note,
+            "colours": [
+                ("the track", css(np.divide(TRACK_COLOUR, 255))),
+                ("the segmentation mask that it uses", css(np.divide(CANDIDATE_COLOUR, 255))),
+            ],
             "timeline": _timeline(track),
+            "states": TRACK_STATES,
+            "marks": "found again after a loss",
+            "view_states": VIEW_STATES,
+            "view_label": "medians of overlap, depth residual and contour distance",
             "charts": [
                 _chart(values, label, least, most)
                 for values, label, least, most in (
@@ -80,43 +90,8 @@ def read_track(
                 )
                 if np.isfinite(values).any()
             ],
-            "track_states": list(TRACK_STATES.items()),
-            "view_states": list(VIEW_STATES.items()),
-            "colours": {
-                "track": "#{:02x}{:02x}{:02x}".format(*TRACK_COLOUR),
-                "candidate": "#{:02x}{:02x}{:02x}".format(*CANDIDATE_COLOUR),
-            },
+            "wide_chart": "",
         }
-
-
-def _sheet(
-    name: str,
-    paths: SequencePaths,
-    mesh: ObjectMesh,
-    poses: np.ndarray,
-    kept: Callable[[int, int], bytes],
-    overlap: np.ndarray,
-) -> tuple[EncodedImage | None, str]:
-    """Draw the outlines of track and candidate over crops of the images.
-
-    If an image is unreadable, return None and the reason.
-
-    Args:
-        poses: (T, 4, 4) master_from_object.
-        kept: as in :func:`read_track`.
-        overlap: (T, C) of the track with the candidate.
-    """
-
-    def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
-        return _cell(camera, rgb, mesh, poses[t], kept(t, c))
-
-    try:
-        with artefacts.read(paths.scene, SCENE) as scene, Frames.open(paths.frames) as images:
-            shown = images.showing(scene["image_of"])
-            frames, rig = choose_frames(1 - _mean(overlap, 1), 5), Rig.from_artefact(scene)
-            return make_sheet(name, shown, rig, frames, _CELL_PX, draw), ""
-    except (UserError, ValueError) as error:  # ValueError: a candidate that does not decode
-        return None, str(error)
 
 
 def _timeline(track: artefacts.Artefact) -> str:
@@ -141,12 +116,11 @@ def _timeline(track: artefacts.Artefact) -> str:
     for c, name in enumerate(track.text("camera_names")):
         used = np.isfinite(overlaps[c])
         good = overlaps[c] >= GOOD_OVERLAP
-        views = np.where(used, np.where(good, "agrees", "partly"), "nothing").tolist()
         label = f"{100 * used.mean():.0f} % used"
         if used.any():
             label += f" · IoU {finite_median(overlaps[c]):.2f}"
             label += _median_text(1e3 * depths[c], "mm") + _median_text(contours[c], "px")
-        rows.append(charts.TimelineRow(name, charts.state_runs(views, VIEW_STATES), label))
+        rows.append(view_row(name, used, good, VIEW_STATES, label))
     marks = [(t - 1, f"{t}: found again") for t in np.flatnonzero(track["recovered"]).tolist()]
     return charts.timeline(rows, len(states), marks)
 

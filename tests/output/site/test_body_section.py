@@ -13,7 +13,7 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.output.site import body_section, charts
 from intercap_core.output.site.body_section import FIT_COLOUR, KEYPOINT_COLOUR
-from intercap_core.output.site.drawing import SquareCrop
+from intercap_core.output.site.fit_section import SquareCrop
 from tests.helpers import fitted_capture as fitted
 
 
@@ -48,7 +48,7 @@ def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -
     assert timeline.count('class="state partly"') == 1
     assert timeline.count('class="state nothing"') == 1
     assert "100 % visible · 1.9 px" in timeline and "0 % visible" in timeline
-    over_time, by_joint = section["charts"]
+    (over_time,), by_joint = section["charts"], section["wide_chart"]
     assert "largest deviation of a joint" in over_time
     assert "left wrist" in by_joint and "20.0, up to 20.0" in by_joint
     assert "10.0, up to 40.0" in by_joint and "right fingers" in by_joint

@@ -14,7 +14,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.output.site import capture_section, charts
 from intercap_core.output.site.capture_pictures import choose_set, floor_profiles
-from intercap_core.output.site.drawing import EncodedImage
+from intercap_core.output.site.drawing import EncodedImage, pinhole
 from intercap_core.output.site.point_cloud import FusedCloud, Viewpoint, fuse, splat
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.reduced_capture import Reduction
@@ -163,18 +163,17 @@ def _both(first: FusedCloud, second: FusedCloud) -> FusedCloud:
 
 
 def test_near_points_occlude_far_points() -> None:
-    view = Viewpoint.towards(np.zeros(3), 0.0, 0.0, 4.0, 100.0, (60, 60))
+    view = Viewpoint.towards(np.zeros(3), 0.0, 0.0, 4.0, pinhole(60, 60, 100.0))
     cloud = _both(_wall(0.0), _wall(1.0, camera=1))
     picture, depth = splat(cloud, view)
     assert depth[30, 30] == pytest.approx(3.0) and picture[30, 30, 0] == pytest.approx(0.75)
     assert depth[15:45, 15:45].max() == pytest.approx(3.0)  # no holes
-    assert np.isinf(
-        splat(_wall(0.0), Viewpoint.towards(np.zeros(3), np.pi, 0.0, 4.0, 100.0, (60, 60)))[1]
-    ).all()
+    behind = Viewpoint.towards(np.zeros(3), np.pi, 0.0, 4.0, pinhole(60, 60, 100.0))
+    assert np.isinf(splat(_wall(0.0), behind)[1]).all()
 
 
 def test_a_point_is_drawn_where_the_view_projects_it() -> None:
-    view = Viewpoint.towards(np.array([0, 0, 1.0]), np.pi / 2, 0.0, 5.0, 100.0, (101, 101))
+    view = Viewpoint.towards(np.array([0, 0, 1.0]), np.pi / 2, 0.0, 5.0, pinhole(101, 101, 100.0))
     at, z = view.project(np.array([[0, 0, 1.0], [-1, 0, 1], [0, 0, 2]]))
     assert z == pytest.approx([5, 5, 5])
     assert at == pytest.approx(np.array([[50, 50], [70, 50], [50, 30]]))  # x to the left, z up
@@ -200,7 +199,7 @@ def test_floor_profiles_are_median_heights_by_camera() -> None:
     up = np.tile(np.float32([0, 0, 1]), (len(points), 1))
     camera = np.zeros(len(points), np.int32)
     (profile,) = floor_profiles(FusedCloud(points, up, up, camera), np.zeros(2))
-    assert profile.height == pytest.approx(0.01 * profile.along, abs=3e-4)
+    assert profile.y == pytest.approx(10 * profile.x, abs=0.3)  # mm
     assert not floor_profiles(FusedCloud(points, -up, up, camera), np.zeros(2))
 
 
@@ -213,4 +212,4 @@ def test_floor_profiles_avoid_objects() -> None:
     up = np.tile(np.float32([0, 0, 1]), (len(points) + 1, 1))
     cloud = FusedCloud(np.concatenate([points, leg]), up, up, np.zeros(len(up), np.int32))
     (profile,) = floor_profiles(cloud, np.zeros(2))
-    assert profile.height == pytest.approx(0 * profile.along)
+    assert profile.y == pytest.approx(0 * profile.x)

@@ -12,7 +12,7 @@ import pytest
 
 from intercap_core.commands.pictures import draw_closeups
 from intercap_core.errors import UserError
-from intercap_core.output.site import closeups
+from intercap_core.output.site import closeups, drawing
 from intercap_core.output.site.closeups import Handling, Hold
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.helpers import fitted_capture as fitted
@@ -45,7 +45,7 @@ def handling(capture: fitted.Capture) -> Handling:
     return read(capture, capture.paths["truth"])
 
 
-def cells(picture: closeups.EncodedImage, columns: int) -> np.ndarray:
+def cells(picture: drawing.EncodedImage, columns: int) -> np.ndarray:
     """(rows, columns, 200, 200, 3) RGB of the picture's cells."""
     image = cv2.imdecode(np.frombuffer(picture.content, np.uint8), 1)[..., ::-1].astype(int)
     assert image.shape == (picture.height, picture.width, 3)
