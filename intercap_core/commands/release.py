@@ -15,6 +15,7 @@ from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.inputs.files import name_some
 from intercap_core.output.release import manifest
 from intercap_core.output.release.datasheet import statements
+from intercap_core.output.site.measures import made_by_stage
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project, tidy
@@ -79,18 +80,14 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
 def check_release(folder: Path) -> bool:
     """Print how a folder differs from its list; True if nothing is missing or changed."""
     count, found = manifest.check(folder, threads=os.cpu_count() or 1)
-    for what, paths in (
-        ("missing", found.missing),
-        ("changed", found.changed),
-        ("not in the list", found.unknown),
-    ):
+    for what, paths in found.items():
         for path in paths[:_PRINTED]:
             print(f"{what}: {path}")
         if len(paths) > _PRINTED:
             print(f"{what}: {len(paths) - _PRINTED} more")
-    wrong = len(found.missing) + len(found.changed)
+    wrong = len(found["missing"]) + len(found["changed"])
     print(f"{folder}: {count - wrong} of {count} files are as released")
-    return not found
+    return not wrong
 
 
 def _check_complete(project: Project) -> None:
@@ -122,16 +119,12 @@ def _check_complete(project: Project) -> None:
 
 def _made(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
     """By stage: each version and settings digest, with its sequences."""
-    found: dict[str, dict[tuple[int, str], list[str]]] = {}
-    for summary in summaries:
-        for stage, made in summary.made_by.items():
-            found.setdefault(stage, {}).setdefault(made, []).append(summary.name)
     return {
         stage: [
             {"version": version, "settings": digest, "sequences": names}
-            for (version, digest), names in by.items()
+            for version, digest, names in entries
         ]
-        for stage, by in found.items()
+        for stage, entries in made_by_stage(summaries).items()
     }
 
 

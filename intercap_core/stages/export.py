@@ -19,7 +19,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export import body_files, images
-from intercap_core.output.export.about import About, Deviations, ExportBody, Physics, Verdict
+from intercap_core.output.export.about import About, ExportBody, Physics, Verdict, read_deviations
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.format import Content
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
@@ -88,9 +88,11 @@ def run(
             names = images.name_images(frames, content.scenes)
             content = replace(content, frames=frames, image_names=names)
             if settings.images or settings.undistort:
-                images.write(output, frames, rig, content.scenes, names, [f.name for f in written])
+                images.write(output, content, [format_.name for format_ in written])
         for format_ in written:
-            coordinates[format_.name] = format_.write(output, content)
+            folder = output / format_.name
+            folder.mkdir(exist_ok=True)
+            coordinates[format_.name] = format_.write(folder, content)
     about = content.about
     files: dict[str, dict[str, str]] = {}
     if any(format_.holds_parameters for format_ in written):
@@ -122,7 +124,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
         None if mesh is None else StatedContact.read(paths.joint),
         Verdict.of(measured),
         None if mesh is None else ContactVertices.read(paths.metrics, motion, mesh),
-        None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
+        {} if motion.made_by else read_deviations(paths.body_fit, paths.object_track, motion),
         None if mesh is None else Physics.of(measured),
         motion.made_by,
         measured.has_truth,

@@ -15,10 +15,13 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.config import ExportSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.flags import Flags
 from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export.about import About, ExportBody, Verdict
+from intercap_core.output.export.format import Content
 from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.silhouettes import Scenes
 from intercap_core.schemas import JOINT
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import export
@@ -59,6 +62,14 @@ def plain_about(motion: Motion) -> About:
     total = len(motion)
     verdict = Verdict((), np.zeros((0, total)), ())
     return About(NAME, ExportBody.of(motion.model, "neutral"), Flags.of(total, []), None, verdict)
+
+
+def content(scenes: Scenes, object_: ObjectEntry, **settings: Any) -> Content:
+    """What the writers of formats get, without facts about the frames; the master is z-up."""
+    return Content(
+        scenes.motion, np.eye(4), scenes.motion, ExportSettings(**settings),
+        plain_about(scenes.motion), scenes, scenes.rig, object_,
+    )  # fmt: skip
 
 
 def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:

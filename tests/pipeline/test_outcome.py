@@ -221,7 +221,7 @@ def test_an_export_that_fails_leaves_the_earlier_one_and_a_new_one_replaces_it(
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(parameters, "write_intercap", full)
+        patch.setattr(parameters, "intercap_result", full)
         with pytest.raises(OSError, match="no space"):
             run_step("export", project, "s01", output=out)
     assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,16 @@ SMPLX, OPEN = "smplx", "intercap-open-body"  # names of surface models
 DEVIATIONS_SOURCE = (
     "stated by the sequential fits of body and object, before the joint fit, which states none"
 )
+# Name in JSON ("" = omitted), factor and number of digits, by name of an array of npz files
+_IN_JSON: dict[str, tuple[str, float, int | None]] = {
+    "contact_probability": ("contact_probability", 1.0, 4),
+    "contact_threshold_m": ("contact_threshold_mm", 1e3, 3),
+    "body_contact_distance": ("", 1.0, None),
+    "object_contact_distance": ("", 1.0, None),
+    "joint_sigma": ("joint_sigma_mm", 1e3, 1),
+    "object_position_sigma": ("object_position_sigma_mm", 1e3, 2),
+    "object_rotation_sigma": ("object_rotation_sigma_deg", math.degrees(1.0), 3),
+}
 _VERDICT_MEANING = (
     "held_in: medians over the frames that the camera judges, of the result; held_out: of a result "
     "fitted without the camera; shift_mm: distance between both results for each part"
@@ -45,7 +56,6 @@ class ExportBody:
     """The body file of the parameters. With another file, they describe another person."""
 
     path: Path
-    """Body file."""
     gender: str
     num_vertices: int
     num_betas: int
@@ -66,7 +76,6 @@ class ExportBody:
         return OPEN if self.is_open else SMPLX
 
     def to_json(self) -> dict[str, Any]:
-        """Serialize for JSON."""
         return {
             "surface_model_type": self.surface_model,
             "body_file": self.path.name,
@@ -76,6 +85,9 @@ class ExportBody:
             "num_betas": self.num_betas,
             "num_expression": self.num_expression,
         }
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        return {key: np.array(value) for key, value in self.to_json().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +99,9 @@ class Verdict:
     """
 
     stated: Sequence[StatedError]
-    """Stated error of each part."""
     per_frame_mm: np.ndarray
     """(P, T) stated error of each part by frame, millimetres; NaN = none is stated."""
     cameras: Sequence[HeldOutCamera]
-    """Cameras that were held out."""
 
     @classmethod
     def of(cls, metrics: SequenceMetrics) -> Verdict:
@@ -119,7 +129,6 @@ class Verdict:
         }
 
     def per_frame_json(self) -> dict[str, Any]:
-        """Serialize the stated errors by part and frame."""
         return {
             "stated_error_mm": {
                 self.stated[part].part: rounded_lists(self.per_frame_mm[part], 2)
@@ -138,7 +147,6 @@ class Verdict:
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Serialize for npz files."""
         stated = [self.stated[part] for part in self.stated_parts]
         arrays = {
             "stated_error_part": np.array([error.part for error in stated]),
@@ -185,100 +193,50 @@ class Physics:
 
     figures: dict[str, float]
     """Figures of :func:`.physics_figures`."""
-    carriers: Sequence[str]
-    """(T,) what carries the object; empty = not tested."""
-    bad: np.ndarray
-    """(T,) bool, physics contradicts the pose."""
+    per_frame: dict[str, np.ndarray]
+    """``carrier`` (T,): what carries the object; ``physics_bad`` (T,) bool: physics contradicts
+    the pose; empty = not tested."""
     note: str
     """What is not judged, and why; "" = nothing."""
 
     @classmethod
     def of(cls, metrics: SequenceMetrics) -> Physics:
         values = metrics.values
-        return cls(
-            physics_figures([metrics]),
-            [str(name) for name in values.get("physics/carrier", ())],
-            values.get("physics/bad", np.zeros(0, bool)),
-            metrics.physics_note,
-        )
+        per_frame: dict[str, np.ndarray] = {}
+        if "physics/carrier" in values:
+            carriers = np.array([str(name) for name in values["physics/carrier"]])
+            per_frame = {"carrier": carriers, "physics_bad": values["physics/bad"]}
+        return cls(physics_figures([metrics]), per_frame, metrics.physics_note)
 
     def to_json(self) -> dict[str, Any]:
         """Serialize everything but the values per frame."""
         figures = {name: round(value, 3) for name, value in self.figures.items()}
         return {"physics": figures | ({"note": self.note} if self.note else {})}
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Serialize the values per frame for npz files."""
-        if not self.carriers:
-            return {}
-        return {"carrier": np.array(self.carriers), "physics_bad": self.bad}
 
-
-@dataclass(frozen=True, eq=False)
-class Deviations:
-    """Standard deviations along one coordinate that the sequential fits state.
+def read_deviations(body_fit: Path, object_track: Path, motion: Motion) -> dict[str, np.ndarray]:
+    """Read standard deviations along one coordinate that the sequential fits state, for npz files.
 
     Each is the root mean square over the three coordinates and therefore valid in every frame.
+    Units are metres and radians; NaN = lost track. Raises UserError if the number of frames of an
+    artefact differs from the motion's, and as reading does.
     """
-
-    joint: np.ndarray
-    """(T, 55) standard deviation of each body joint, metres."""
-    object_position: np.ndarray | None
-    """(T,) that of the object's position, metres; NaN = lost track; None without an object."""
-    object_turn: np.ndarray | None
-    """(T,) that of its rotation, radians; NaN = lost track; None without an object."""
-
-    @classmethod
-    def read(cls, body_fit: Path, object_track: Path, motion: Motion) -> Deviations:
-        """Read both artefacts.
-
-        Raises UserError if their number of frames differs from the motion's, and as reading does.
-        """
-        with artefacts.read(body_fit, BODY_FIT) as fit:
-            joint = fit["joint_sigma"].astype(np.float32)
-        _check_frames(body_fit, "body_fit", len(joint), motion)
-        if not motion.has_object:
-            return cls(joint, None, None)
+    with artefacts.read(body_fit, BODY_FIT) as fit:
+        joint = fit["joint_sigma"].astype(np.float32)
+    _check_frames(body_fit, "body_fit", len(joint), motion)
+    arrays = {
+        "joint_name": np.array(JOINT_NAMES),
+        "joint_sigma": joint,
+        "sigma_source": np.array(DEVIATIONS_SOURCE),
+    }
+    if motion.has_object:
         with artefacts.read(object_track, OBJECT_TRACK) as track:
             covariance, lost = track["covariance"], track["lost"]
         _check_frames(object_track, "object_track", len(lost), motion)
-        turn, position = (
-            np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
-            for part in (slice(0, 3), slice(3, 6))
-        )
-        return cls(
-            joint,
-            np.where(lost, np.nan, position).astype(np.float32),
-            np.where(lost, np.nan, turn).astype(np.float32),
-        )
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Serialize for npz files: metres and radians."""
-        arrays = {
-            "joint_name": np.array(JOINT_NAMES),
-            "joint_sigma": self.joint,
-            "sigma_source": np.array(DEVIATIONS_SOURCE),
-        }
-        if self.object_position is not None and self.object_turn is not None:
-            arrays |= {
-                "object_position_sigma": self.object_position,
-                "object_rotation_sigma": self.object_turn,
-            }
-        return arrays
-
-    def to_json(self) -> dict[str, Any]:
-        """Serialize for JSON: millimetres and degrees, None for NaN."""
-        entries: dict[str, Any] = {
-            "joint_name": list(JOINT_NAMES),
-            "joint_sigma_mm": rounded_lists(1e3 * self.joint, 1),
-            "sigma_source": DEVIATIONS_SOURCE,
-        }
-        if self.object_position is not None and self.object_turn is not None:
-            entries |= {
-                "object_position_sigma_mm": rounded_lists(1e3 * self.object_position, 2),
-                "object_rotation_sigma_deg": rounded_lists(np.degrees(self.object_turn), 3),
-            }
-        return entries
+        for name, part in (("position", slice(3, 6)), ("rotation", slice(0, 3))):
+            sigma = np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
+            arrays[f"object_{name}_sigma"] = np.where(lost, np.nan, sigma).astype(np.float32)
+    return arrays
 
 
 def _check_frames(path: Path, stage: str, frames: int, motion: Motion) -> None:
@@ -301,8 +259,9 @@ class About:
     verdict: Verdict
     touching: ContactVertices | None = None
     """Contact by vertex; None without an object."""
-    deviations: Deviations | None = None
-    """Standard deviations; None for imported results, which state none."""
+    deviations: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Standard deviations, from :func:`read_deviations`; empty for imported results, which state
+    none."""
     physics: Physics | None = None
     """Physics of the object; None without an object."""
     made_by: str = ""
@@ -331,16 +290,24 @@ class About:
                 interval.model_dump(include={"part", "start", "end"})
                 for interval in self.contact.intervals()
             ]
-        return entries | {"by_frame": self._per_frame_json()}
+        by_frame = self.verdict.per_frame_json()
+        for name, values in self._measured_arrays().items():
+            key, factor, digits = _IN_JSON.get(name, (name, 1.0, None))
+            if key:
+                by_frame[key] = (
+                    values.tolist() if digits is None else rounded_lists(factor * values, digits)
+                )
+        return entries | {"by_frame": by_frame}
 
     def to_json_text(self, coordinates: Coordinates) -> str:
-        """Serialize to the text of a JSON file."""
         return json.dumps(self.to_json(coordinates), separators=(",", ":")) + "\n"
 
+    def write_json(self, path: Path, coordinates: Coordinates) -> None:
+        path.write_text(self.to_json_text(coordinates), encoding="utf-8")
+
     def to_arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
-        """Serialize for npz files."""
         return {
-            **{key: np.array(value) for key, value in self.body.to_json().items()},
+            **self.body.to_arrays(),
             **coordinates.to_arrays(),
             **({"made_by": np.array(self.made_by)} if self.made_by else {}),
             **self.per_frame_arrays(),
@@ -348,12 +315,17 @@ class About:
 
     def per_frame_arrays(self) -> dict[str, np.ndarray]:
         """Serialize flags, contact, deviations and verdict of every frame for npz files."""
-        arrays = {
+        return {
             "flag_part": np.array(PARTS),
             "flagged": self.flags.flagged,
             "flag_reason": np.array(list(self.flags.reasons)),
             **self.verdict.to_arrays(),
+            **self._measured_arrays(),
         }
+
+    def _measured_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize contact, deviations and physics of every frame for npz files."""
+        arrays: dict[str, np.ndarray] = {}
         if self.contact is not None:
             arrays |= {
                 "contact_region": np.array(self.contact.regions),
@@ -362,24 +334,7 @@ class About:
             }
         if self.touching is not None:
             arrays |= self.touching.to_arrays()
-        if self.deviations is not None:
-            arrays |= self.deviations.to_arrays()
+        arrays |= self.deviations
         if self.physics is not None:
-            arrays |= self.physics.to_arrays()
+            arrays |= self.physics.per_frame
         return arrays
-
-    def _per_frame_json(self) -> dict[str, Any]:
-        entries = self.verdict.per_frame_json()
-        if self.contact is not None:
-            entries |= {
-                "contact_region": list(self.contact.regions),
-                "contact_probability": rounded_lists(self.contact.probability, 4),
-                "contact_annotated": self.contact.annotated.tolist(),
-            }
-        if self.touching is not None:
-            entries |= self.touching.to_json()
-        if self.deviations is not None:
-            entries |= self.deviations.to_json()
-        if self.physics is not None:
-            entries |= {key: values.tolist() for key, values in self.physics.to_arrays().items()}
-        return entries

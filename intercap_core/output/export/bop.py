@@ -14,11 +14,10 @@ import trimesh
 
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export.about import About
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.meshes import ply
 from intercap_core.output.export.motion import Coordinates
-from intercap_core.output.export.silhouettes import Scenes, Silhouettes
+from intercap_core.output.export.silhouettes import Silhouettes
 
 SPLIT = "test"  # folder of the scenes: in BOP, images whose poses are known
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
@@ -35,20 +34,21 @@ def scene_folder(folder: Path, number: int) -> Path:
     return folder / SPLIT / f"{number:06d}"
 
 
-def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: bool) -> None:
+def write(folder: Path, content: Content) -> Coordinates:
     """Write ``models/``, one scene folder per camera in the rig's order, and the targets.
 
     An image has the number of its frame set. The image of a delayed camera shows an earlier frame,
     which ``scene_about.json`` names. Poses are those at the image's own exposure. Depth images that
     a scene folder already has determine the pixels with valid depth.
-
-    Args:
-        obj_id: number of the object's model.
-        masks: also write masks and boxes of the object, with occlusion by the body.
     """
-    mesh = scenes.mesh
-    assert mesh is not None
-    _write_model(folder / "models", mesh, obj_id)
+    scenes, about, coordinates = (
+        content.scenes,
+        content.about,
+        Coordinates.of(content.motion, UNITS),
+    )
+    assert scenes.mesh is not None and content.object_ is not None
+    obj_id = object_id(content.object_.mesh)
+    _write_model(folder / "models", scenes.mesh, obj_id)
     lenses: dict[str, Any] = {}
     targets = []
     for number, camera in enumerate(scenes.rig):
@@ -59,7 +59,7 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
         _dump(scene / "scene_gt.json", scene_gt(camera, poses, obj_id))
         lenses[scene.name] = {"camera": camera.name, **scenes.lens_of(number)}
         info: dict[str, Any] = {}
-        if masks:
+        if content.settings.masks:
             info = {
                 str(drawn.image): [_write_masks(scene, drawn, camera)]
                 for drawn in scenes.draw(number)
@@ -84,8 +84,9 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
     _dump(folder / "camera.json", camera_json)
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
-    text = about.to_json_text(Coordinates.of(scenes.motion, UNITS))
-    (folder / "about.json").write_text(text, encoding="utf-8")
+    coordinates = Coordinates.of(content.motion, UNITS)
+    about.write_json(folder / "about.json", coordinates)
+    return coordinates
 
 
 def _write_model(folder: Path, mesh: ObjectMesh, obj_id: int) -> None:
@@ -180,13 +181,6 @@ def _dump(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _write(folder: Path, content: Content) -> Coordinates:
-    assert content.object_ is not None
-    number = object_id(content.object_.mesh)
-    write(folder / "bop", content.scenes, number, content.about, masks=content.settings.masks)
-    return Coordinates.of(content.motion, UNITS)
-
-
 _README = """
 bop/                split "test": one scene per camera, in the order of lenses.json; lengths in
     millimetres
@@ -213,12 +207,12 @@ bop/                split "test": one scene per camera, in the order of lenses.j
 FORMATS = (
     ExportFormat(
         name="bop",
-        path="*/export/bop",
         content="the object's poses, masks and lenses in BOP's format",
         includes="*/export/bop/**/*.json",
         media_type="application/json",
+        merged="bop of all sequences as one dataset with the split test",
         readme=_README,
-        write=_write,
+        write=write,
         needs_object=True,
         reads_images=True,
         draws_bodies=True,

@@ -36,12 +36,7 @@ _CHILDREN = {
 }
 
 
-def y_up(motion: Motion) -> Motion:
-    """Turn a motion from its z-up frame into one with y up."""
-    return motion.moved(_YUP_FROM_ZUP, f"y up, turned by -90 degrees about x from: {motion.frame}")
-
-
-def bvh_text(motion: Motion) -> str:
+def _bvh_text(motion: Motion) -> str:
     """Serialize a motion whose frame has y up.
 
     The root has six channels, x, y, z in centimetres and three angles; the other joints have
@@ -53,7 +48,9 @@ def bvh_text(motion: Motion) -> str:
     order: list[int] = []
     hierarchy = "\n".join(_joint_lines(0, "", joints, keypoints, order))
     poses = motion.parameters.full_pose().double().numpy()
-    angles = [_euler_angles(poses[:, joint]) for joint in order]
+    turns = [Rotation.from_rotvec(poses[:, joint]).as_euler("ZXY", degrees=True) for joint in order]
+    # continuous in time, because programs interpolate each channel alone
+    angles = [np.unwrap(turn, axis=0, period=360) for turn in turns]
     root = _CM * (motion.parameters.transl.numpy() + motion.pelvis)
     rows = np.concatenate([root, *angles], axis=1)
     frames = "\n".join(" ".join(f"{value:.6f}" for value in row) for row in rows)
@@ -93,23 +90,12 @@ def _numbers(metres: np.ndarray) -> str:
     return " ".join(f"{_CM * value:.6f}" for value in metres)
 
 
-def _euler_angles(poses: np.ndarray) -> np.ndarray:
-    """Return angles (T, 3) about z, x, y, degrees, of rotation vectors (T, 3).
-
-    They are continuous in time, because programs interpolate each channel alone.
-    """
-    angles = Rotation.from_rotvec(poses).as_euler("ZXY", degrees=True)
-    return np.unwrap(angles, axis=0, period=360)
-
-
 def _write(folder: Path, content: Content) -> Coordinates:
-    motion = y_up(content.z_up)
+    frame = f"y up, turned by -90 degrees about x from: {content.z_up.frame}"
+    motion = content.z_up.moved(_YUP_FROM_ZUP, frame)
     coordinates = Coordinates.of(motion, UNITS)
-    (folder / "bvh").mkdir()
-    path = folder / "bvh" / f"{motion.sequence}.bvh"
-    path.write_text(bvh_text(motion), encoding="ascii")
-    text = content.about.to_json_text(coordinates)
-    (folder / "bvh" / "about.json").write_text(text, encoding="utf-8")
+    (folder / f"{motion.sequence}.bvh").write_text(_bvh_text(motion), encoding="ascii")
+    content.about.write_json(folder / "about.json", coordinates)
     return coordinates
 
 
@@ -122,7 +108,6 @@ bvh/about.json      the body file, and the facts about each frame, below
 FORMATS = (
     ExportFormat(
         name="bvh",
-        path="*/export/bvh",
         content="skeleton with hands, centimetres, y up",
         includes="*/export/bvh/*.bvh",
         media_type="text/plain",

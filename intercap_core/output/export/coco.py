@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,9 @@ import numpy as np
 
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.output.export.about import About
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion, posed_batches
-from intercap_core.output.export.silhouettes import Scenes, Silhouettes
+from intercap_core.output.export.silhouettes import Silhouettes
 
 PERSON, OBJECT = 1, 2
 KEYPOINTS = (
@@ -31,19 +30,15 @@ _SKELETON = [
 ]  # fmt: skip
 
 
-def units(scenes: Scenes) -> str:
-    """Return the units of all numbers, in words."""
-    images = "undistorted images" if scenes.undistorted else "images as recorded"
-    return f"pixels of the {images}, x right and y down, seconds"
+def _write(folder: Path, content: Content) -> Coordinates:
+    """Write the annotations of all colour images.
 
-
-def write(path: Path, scenes: Scenes, about: About, names: Sequence[Mapping[int, str]]) -> None:
-    """Write the annotations of all colour images to ``path``.
-
-    Args:
-        names: for each camera, names of the recorded images by number. In the file they are in a
-            folder named as the camera, whether or not the images are exported.
+    Names of images start with a folder named as the camera, whether or not they are exported.
     """
+    scenes, about, names = content.scenes, content.about, content.image_names
+    kind = "undistorted images" if scenes.undistorted else "images as recorded"
+    units = f"pixels of the {kind}, x right and y down, seconds"
+    coordinates = Coordinates.of(scenes.motion, units)
     keypoints = _keypoints(scenes.motion)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -69,18 +64,19 @@ def write(path: Path, scenes: Scenes, about: About, names: Sequence[Mapping[int,
     ]
     if scenes.mesh is not None:
         categories.append({"id": OBJECT, "name": scenes.mesh.name, "supercategory": "object"})
-    content = {
+    written = {
         "info": {
             "description": scenes.motion.sequence,
             "lenses": {camera.name: scenes.lens_of(n) for n, camera in enumerate(scenes.rig)},
-            **about.to_json(Coordinates.of(scenes.motion, units(scenes))),
+            **about.to_json(coordinates),
         },
         "images": images,
         "annotations": annotations,
         "categories": categories,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, separators=(",", ":")) + "\n", encoding="utf-8")
+    text = json.dumps(written, separators=(",", ":"))
+    (folder / "annotations.json").write_text(text + "\n", encoding="utf-8")
+    return coordinates
 
 
 def _keypoints(motion: Motion) -> np.ndarray:
@@ -125,10 +121,8 @@ def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> 
     lens = camera.colour
     local = apply(camera.colour_from_master, points.astype(np.float64))
     keypoints = np.zeros((len(points), 3))
-    for k in np.flatnonzero(lens.inside_model(local)):
+    for k in np.flatnonzero(lens.sees(local)):
         x, y = lens.project(local[k : k + 1])[0]
-        if not (-0.5 <= x < lens.width - 0.5 and -0.5 <= y < lens.height - 0.5):
-            continue
         row, column = round(y) - drawn.body.y0, round(x) - drawn.body.x0
         visibility = 1
         height, width = drawn.depth.shape
@@ -138,12 +132,6 @@ def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> 
                 visibility = 2
         keypoints[k] = x, y, visibility
     return keypoints
-
-
-def _write(folder: Path, content: Content) -> Coordinates:
-    path = folder / "coco" / "annotations.json"
-    write(path, content.scenes, content.about, content.image_names)
-    return Coordinates.of(content.motion, units(content.scenes))
 
 
 _README = """
@@ -161,6 +149,7 @@ FORMATS = (
         content="masks, boxes and keypoints of person and object",
         includes="*/export/coco/annotations.json",
         media_type="application/json",
+        merged="coco of all sequences as one file",
         readme=_README,
         write=_write,
         reads_images=True,

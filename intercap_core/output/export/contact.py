@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import vertex_contact
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.solve.time_series import runs
 from intercap_core.output.export.motion import Motion
 from intercap_core.schemas import CONTACT_M, JOINT, METRICS
 
@@ -55,15 +56,13 @@ class StatedContact:
         unless an annotation states them exactly.
         """
         intervals = []
-        for r, region in enumerate(self.regions):
-            on = np.concatenate([[False], self.probability[:, r] >= 0.5, [False]])
-            changes = np.flatnonzero(np.diff(on.astype(np.int8)))
-            p = np.concatenate([[0.0], self.probability[:, r], [0.0]])
-            exact = abs(np.diff(p)) == 1  # before each frame: from 0 to 1 or back
-            for start, end in changes.reshape(-1, 2).tolist():
-                uncertain = _UNCERTAIN[bool(exact[start]), bool(exact[end])]
+        for region, p in zip(self.regions, self.probability.T, strict=True):
+            steps = np.diff(np.concatenate([[0.0], p, [0.0]]))
+            exact = abs(steps) == 1  # before each frame: from 0 to 1 or back
+            for first, last in runs(p >= 0.5):
+                uncertain = _UNCERTAIN[bool(exact[first]), bool(exact[last + 1])]
                 intervals.append(
-                    ContactInterval(part=region, start=start, end=end, uncertain=uncertain)
+                    ContactInterval(part=region, start=first, end=last + 1, uncertain=uncertain)
                 )
         return intervals
 
@@ -104,9 +103,7 @@ class ContactVertices:
     """Vertices of the body that touch the object, and of the object that touch the body."""
 
     body: VertexRuns
-    """Vertices of the body that touch the object."""
     object_: VertexRuns
-    """Vertices of the object that touch the body."""
 
     @classmethod
     def read(cls, metrics: Path, motion: Motion, mesh: ObjectMesh) -> ContactVertices:
@@ -117,18 +114,11 @@ class ContactVertices:
         """
         surfaces = []
         with artefacts.read(metrics, METRICS) as artefact:
-            for key, surface, count in (
-                (
-                    "body_contact_distance",
-                    f"the body in {motion.model.path.name}",
-                    motion.model.num_vertices,
-                ),
-                (
-                    "object_contact_distance",
-                    f"the mesh of object {mesh.name!r}",
-                    len(mesh.vertices),
-                ),
+            for name, surface, count in (
+                ("body", f"the body in {motion.model.path.name}", motion.model.num_vertices),
+                ("object", f"the mesh of object {mesh.name!r}", len(mesh.vertices)),
             ):
+                key = f"{name}_contact_distance"
                 if key not in artefact:
                     raise UserError(
                         f"{metrics}: has no {key}, although sequence {motion.sequence!r} has an "
@@ -146,7 +136,6 @@ class ContactVertices:
         return cls(*surfaces)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Serialize for npz files."""
         arrays = {"contact_threshold_m": np.array(CONTACT_M)}
         for name, surface in (("body", self.body), ("object", self.object_)):
             arrays |= {
@@ -155,13 +144,3 @@ class ContactVertices:
                 f"{name}_contact_distance": surface.distance,
             }
         return arrays
-
-    def to_json(self) -> dict[str, Any]:
-        """Serialize for JSON, without the distances."""
-        entries: dict[str, Any] = {"contact_threshold_mm": 1e3 * CONTACT_M}
-        for name, surface in (("body", self.body), ("object", self.object_)):
-            entries |= {
-                f"{name}_contact_offsets": surface.offsets.tolist(),
-                f"{name}_contact_vertices": surface.vertices.tolist(),
-            }
-        return entries

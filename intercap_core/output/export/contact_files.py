@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.output.export.contact import ContactVertices, StatedContact
+from intercap_core.output.export.contact import StatedContact
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates
 
@@ -18,9 +18,9 @@ _DRAFT_HEADER = """\
 """
 
 
-def write(folder: Path, stated: StatedContact, touching: ContactVertices) -> None:
-    """Write contact.tsv, annotation_draft.yaml and contact_vertices.npz into the new ``folder``."""
-    folder.mkdir()
+def _write(folder: Path, content: Content) -> Coordinates:
+    stated, touching = content.about.contact, content.about.touching
+    assert stated is not None and touching is not None
     np.savez(
         folder / "contact_vertices.npz",
         allow_pickle=False,
@@ -30,6 +30,9 @@ def write(folder: Path, stated: StatedContact, touching: ContactVertices) -> Non
     )
     (folder / "contact.tsv").write_text(table(stated), encoding="utf-8")
     (folder / "annotation_draft.yaml").write_text(draft(stated), encoding="utf-8")
+    return Coordinates(
+        "none: numbers of vertices and regions, distances in metres", np.full(3, np.nan)
+    )
 
 
 def table(stated: StatedContact) -> str:
@@ -68,15 +71,6 @@ def draft(stated: StatedContact) -> str:
     return header + "contact:\n" + "".join(lines)
 
 
-def _write(folder: Path, content: Content) -> Coordinates:
-    about = content.about
-    if about.contact is not None and about.touching is not None:
-        write(folder / "contact", about.contact, about.touching)
-    return Coordinates(
-        "none: numbers of vertices and regions, distances in metres", np.full(3, np.nan)
-    )
-
-
 _README = """
 contact/contact.tsv           by frame and body region: probability that it touches the object, as
   the joint stage states it; annotated = 1 touching, 0 not, empty = not annotated
@@ -86,7 +80,6 @@ contact/annotation_draft.yaml the same as intervals, in the format of an annotat
 FORMATS = (
     ExportFormat(
         name="contact",
-        path="*/export/contact",
         content="contact by frame and region, and the vertices that touch",
         includes="*/export/contact/*.tsv",
         media_type="text/tab-separated-values",

@@ -76,18 +76,20 @@ class ExportFormat:
 
     name: str
     """Name in the settings, and of its folder in an export."""
-    path: str
-    """Its files in a dataset's folder, in words, for the dataset's card."""
     content: str
     """What the files hold, in words, for the dataset's card."""
     includes: str
     """Glob of its files in a dataset's folder, for Croissant."""
-    media_type: str
-    """Media type of these files, for Croissant."""
     readme: str
     """Its section of README.txt, a Jinja template with the variables of :func:`.readme.readme`."""
     write: Callable[[Path, Content], Coordinates] = field(compare=False)
-    """Writes the files into the folder of the export; returns the coordinates of the numbers."""
+    """Writes the files into the format's own folder; returns the coordinates of the numbers."""
+    path: str = ""
+    """Its files in a dataset's folder, in words, for the card; "" = all in the folder ``name``."""
+    media_type: str = "application/octet-stream"
+    """Media type of the files that ``includes`` matches."""
+    merged: str = ""
+    """What the file or folder of all sequences holds that :mod:`.merged` writes; "" = none."""
     needs_object: bool = False
     """It describes an object, and is omitted without one."""
     reads_images: bool = False
@@ -100,6 +102,11 @@ class ExportFormat:
     """Module that it imports and that only an extra of this package installs; "" for none."""
     extra: str = ""
     """That extra."""
+
+    @property
+    def files(self) -> str:
+        """Its files in a dataset's folder, in words."""
+        return self.path or f"*/export/{self.name}"
 
     def require_library(self) -> None:
         """Raise UserError that names the extra if the library is not installed."""

@@ -19,7 +19,6 @@ from intercap_core.body.joints import JOINT_NAMES, PARENTS
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.object_track.appearance import linear
-from intercap_core.output.export.about import About
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion, rest_pose
 
@@ -33,9 +32,10 @@ _YUP_FROM_CAMERA = Rotation.from_euler("x", 180, degrees=True)
 
 
 class _Document:
-    """The JSON part and the binary buffer of one file."""
+    """The JSON part and the binary buffer of one file, with one animation."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str, times: np.ndarray) -> None:
+        """``name``: of the animation; ``times``: (T,) of its frames, seconds."""
         self.json: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "intercap-core"},
             "scene": 0,
@@ -48,6 +48,8 @@ class _Document:
         }
         self._chunks: list[bytes] = []
         self._length = 0
+        self._animation: dict[str, Any] = {"name": name, "samplers": [], "channels": []}
+        self._times = self.accessor(times.astype("<f4"), bounds=True)
 
     def accessor(
         self, values: np.ndarray, *, target: int | None = None, bounds: bool = False
@@ -82,60 +84,48 @@ class _Document:
         self.json.setdefault(kind, []).append(entry)
         return len(self.json[kind]) - 1
 
+    def animate(self, node: int, path: str, values: np.ndarray) -> None:
+        """Animate a property of a node: one row of ``values`` per frame, linear interpolation."""
+        samplers, output = self._animation["samplers"], self.accessor(values.astype("<f4"))
+        samplers.append({"input": self._times, "output": output, "interpolation": "LINEAR"})
+        channel = {"sampler": len(samplers) - 1, "target": {"node": node, "path": path}}
+        self._animation["channels"].append(channel)
+
     def bytes(self) -> bytes:
         """Serialize the whole file."""
+        self.add("animations", self._animation)
         self.json["buffers"] = [{"byteLength": self._length}]
         text = json.dumps(self.json, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         binary = b"".join(self._chunks)
         total = 12 + 8 + len(text) + 8 + len(binary)  # file header, and one for each chunk
-        return b"".join(
-            [
-                struct.pack("<4sII", b"glTF", 2, total),
-                struct.pack("<I4s", len(text), b"JSON"),
-                text,
-                struct.pack("<I4s", len(binary), b"BIN\0"),
-                binary,
-            ]
-        )
+        head = struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON")
+        return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
-def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, z_up: bool) -> None:
-    """Write the body, the object unless ``mesh`` is None, and ``about`` in the asset's extras.
-
-    Args:
-        z_up: the motion's frame is z-up; otherwise it is a camera's.
-    """
-    document = _Document()
-    root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
-    document.json["asset"]["extras"] = about.to_json(coordinates(motion, z_up=z_up))
-    times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
-    animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}
-    skeleton, body = _body(document, motion, animation, times)
+def _write(folder: Path, content: Content) -> Coordinates:
+    """Write body and object, and the facts about them in the asset's extras."""
+    motion = content.viewed
+    document = _Document(motion.sequence, np.arange(len(motion)) / motion.fps)
+    root, how = (
+        (_YUP_FROM_ZUP, "") if content.is_z_up else (_YUP_FROM_CAMERA, " as the camera was held")
+    )
+    frame = f"y up{how}, turned by the node world from: {motion.frame}"
+    coordinates = Coordinates(frame, root.apply(motion.up))
+    document.json["asset"]["extras"] = content.about.to_json(coordinates)
+    skeleton, body = _body(document, motion)
     children = [skeleton]
-    if mesh is not None:
-        children.append(_object(document, motion, mesh, animation, times))
+    if content.mesh is not None:
+        children.append(_object(document, motion, content.mesh))
     world = {"name": "world", "rotation": root.as_quat().tolist(), "children": children}
     # glTF ignores the transform of a skinned mesh, so its node is at the top.
     document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]
-    document.add("animations", animation)
-    path.write_bytes(document.bytes())
+    (folder / f"{motion.sequence}.glb").write_bytes(document.bytes())
+    return coordinates
 
 
-def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
-    """Return the coordinates of the scene after the root's rotation."""
-    turn, held = (_YUP_FROM_ZUP, "") if z_up else (_YUP_FROM_CAMERA, " as the camera was held")
-    frame = f"y up{held}, turned by the node world from: {motion.frame}"
-    return Coordinates(frame, turn.apply(motion.up))
-
-
-def _body(
-    document: _Document, motion: Motion, animation: dict[str, Any], times: int
-) -> tuple[int, int]:
-    """Add the skinned mesh, its skeleton and motion; return the indices of pelvis and mesh node.
-
-    ``times`` is the accessor of the frames' times.
-    """
+def _body(document: _Document, motion: Motion) -> tuple[int, int]:
+    """Add the skinned mesh, its skeleton and motion; return the indices of pelvis and mesh node."""
     vertices, joints = rest_pose(motion.model, motion.parameters)
     faces = motion.model.faces.numpy()
     weights = motion.model.skinning_weights.numpy()
@@ -160,40 +150,30 @@ def _body(
         document.add("nodes", node)
     inverse = np.repeat(np.eye(4)[None], len(joints), 0)
     inverse[:, :3, 3] = -joints
-    skin = document.add(
-        "skins",
-        {
-            "joints": list(range(first, first + len(joints))),
-            "skeleton": first,
-            "inverseBindMatrices": document.accessor(
-                np.swapaxes(inverse, 1, 2).reshape(-1, 16).astype("<f4")
-            ),
-        },
-    )
+    bind = document.accessor(np.swapaxes(inverse, 1, 2).reshape(-1, 16).astype("<f4"))
+    nodes = list(range(first, first + len(joints)))
+    skin = document.add("skins", {"joints": nodes, "skeleton": first, "inverseBindMatrices": bind})
     poses = motion.parameters.full_pose().numpy()
     for index in range(len(joints)):
         quaternion = _continuous(Rotation.from_rotvec(poses[:, index]).as_quat())
-        _channel(document, animation, times, first + index, "rotation", quaternion)
+        document.animate(first + index, "rotation", quaternion)
     pelvis = motion.parameters.transl.numpy() + joints[0]
-    _channel(document, animation, times, first, "translation", pelvis)
+    document.animate(first, "translation", pelvis)
     return first, document.add("nodes", {"name": "body", "mesh": shape, "skin": skin})
 
 
-def _object(
-    document: _Document, motion: Motion, mesh: ObjectMesh, animation: dict[str, Any], times: int
-) -> int:
+def _object(document: _Document, motion: Motion, mesh: ObjectMesh) -> int:
     """Add the object's mesh and motion; return the index of its node."""
     geometry = _geometry(document, mesh.vertices, mesh.faces)
-    colours = np.column_stack([mesh.colours, np.full(len(mesh.colours), 255, np.uint8)])
-    geometry["attributes"]["COLOR_0"] = document.accessor(
-        _linear(colours).astype("<f4"), target=_ARRAY
-    )
+    colours = np.empty((len(mesh.colours), 4), "<f4")
+    colours[:, :3], colours[:, 3] = linear(mesh.colours), 1.0  # as glTF's vertex colours are
+    geometry["attributes"]["COLOR_0"] = document.accessor(colours, target=_ARRAY)
     geometry["material"] = _material(document, mesh.name, (1.0, 1.0, 1.0, 1.0))
     shape = document.add("meshes", {"name": mesh.name, "primitives": [geometry]})
     node = document.add("nodes", {"name": mesh.name, "mesh": shape})
     quaternion = _continuous(Rotation.from_matrix(motion.rotation).as_quat())
-    _channel(document, animation, times, node, "rotation", quaternion)
-    _channel(document, animation, times, node, "translation", motion.translation)
+    document.animate(node, "rotation", quaternion)
+    document.animate(node, "translation", motion.translation)
     return node
 
 
@@ -213,42 +193,11 @@ def _material(document: _Document, name: str, colour: tuple[float, ...]) -> int:
     return document.add("materials", {"name": name, "pbrMetallicRoughness": surface})
 
 
-def _channel(
-    document: _Document,
-    animation: dict[str, Any],
-    times: int,
-    node: int,
-    path: str,
-    values: np.ndarray,
-) -> None:
-    """Animate a property of a node: one row of ``values`` per frame, linear interpolation."""
-    output = document.accessor(values.astype("<f4"))
-    animation["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
-    animation["channels"].append(
-        {"sampler": len(animation["samplers"]) - 1, "target": {"node": node, "path": path}}
-    )
-
-
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
     """Choose signs of quaternions (T, 4) so that players interpolate along the shorter arc."""
     flips = np.sign(np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]))
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips < 0, -1.0, 1.0)]))
     return quaternions * signs[:, None]
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """Convert sRGB bytes (V, 4) to linear values, as glTF's vertex colours are."""
-    values = linear(colours)
-    values[:, 3] = colours[:, 3] / 255.0
-    return values
-
-
-def _write(folder: Path, content: Content) -> Coordinates:
-    (folder / "glb").mkdir()
-    viewed, z_up = content.viewed, content.is_z_up
-    path = folder / "glb" / f"{viewed.sequence}.glb"
-    write(path, viewed, content.mesh, content.about, z_up=z_up)
-    return coordinates(viewed, z_up=z_up)
 
 
 _README = """
@@ -261,7 +210,6 @@ glb/*.glb           skinned body (55 joints){{ " and object" if mesh }}, animate
 FORMATS = (
     ExportFormat(
         name="glb",
-        path="*/export/glb",
         content="animated body and object",
         includes="*/export/glb/*.glb",
         media_type="model/gltf-binary",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.rigid.render import render
 from intercap_core.output.export.bop import scene_folder
+from intercap_core.output.export.format import Content
 from intercap_core.output.export.silhouettes import Scenes
 
 _PNG = b"\x89PNG"  # first bytes of a file
@@ -32,27 +33,17 @@ def undistorted(rig: Rig) -> Rig:
 
 def name_images(frames: Frames, scenes: Scenes) -> list[dict[int, str]]:
     """Return for each camera the file names of its recorded colour images by image number."""
-    names: list[dict[int, str]] = []
-    for c in range(len(scenes.rig)):
-        packets = ((image, frames.colour_jpeg(image, c)) for image in sorted(scenes.frames_of(c)))
-        names.append(
-            {
-                image: f"{image:06d}.{'png' if packet.startswith(_PNG) else 'jpg'}"
-                for image, packet in packets
-                if packet is not None
-            }
-        )
-    return names
+    return [
+        {
+            image: f"{image:06d}.{'png' if packet.startswith(_PNG) else 'jpg'}"
+            for image in sorted(scenes.frames_of(c))
+            if (packet := frames.colour_jpeg(image, c)) is not None
+        }
+        for c in range(len(scenes.rig))
+    ]
 
 
-def write(
-    folder: Path,
-    frames: Frames,
-    recorded: Rig,
-    scenes: Scenes,
-    names: Sequence[Mapping[int, str]],
-    formats: Collection[str],
-) -> None:
+def write(folder: Path, content: Content, formats: Collection[str]) -> None:
     """Write the colour images of bop and coco, and the depth images of bop, into an export.
 
     Colour images of a lens that is exported as recorded are copied byte by byte. The others are
@@ -60,12 +51,11 @@ def write(
 
     Args:
         folder: folder of the export.
-        recorded: cameras of the recorded images.
-        scenes: the motion in the cameras of the exported images.
-        names: file names of the colour images, from :func:`name_images`.
         formats: exported formats.
     """
-    for c, (camera, exported) in enumerate(zip(recorded, scenes.rig, strict=True)):
+    frames, scenes = content.frames, content.scenes
+    assert frames is not None
+    for c, (camera, exported) in enumerate(zip(content.recorded, scenes.rig, strict=True)):
         scene = scene_folder(folder / "bop", c)
         places = {"bop": scene / "rgb", "coco": folder / "coco" / camera.name}
         wanted = [place for name, place in places.items() if name in formats]
@@ -74,7 +64,7 @@ def write(
         for place in wanted:
             place.mkdir(parents=True)
         resampling = Resampling(camera, exported.colour)
-        for image, name in names[c].items():
+        for image, name in content.image_names[c].items():
             file, *others = (place / name for place in wanted)
             if resampling.changes:
                 pixels = resampling.colour(frames.colour(image, c))

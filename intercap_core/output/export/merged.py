@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -64,13 +65,15 @@ def write(
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     numbers = class_numbers(objects)
-    coco = {name: path / "coco" for name, path in exports.items() if (path / "coco").is_dir()}
-    if coco:
-        _merge_coco(part / "coco" / "annotations.json", dataset, coco, numbers)
-    bop = {name: path / "bop" for name, path in exports.items() if (path / "bop").is_dir()}
-    if bop:
-        _merge_bop(part / "bop", bop, numbers)
-    missing = [name for name, found in (("coco", coco), ("bop", bop)) if not found]
+    found = {
+        kind: {name: path / kind for name, path in exports.items() if (path / kind).is_dir()}
+        for kind in ("coco", "bop")
+    }
+    if found["coco"]:
+        _merge_coco(part / "coco" / "annotations.json", dataset, found["coco"], numbers)
+    if found["bop"]:
+        _merge_bop(part / "bop", found["bop"], numbers)
+    missing = [kind for kind, folders in found.items() if not folders]
     text = "".join(f"{name} is omitted: no sequence has it\n" for name in missing)
     (part / "README.txt").write_text(
         _README.format(dataset=dataset, count=len(exports), split=SPLIT, missing=text),
@@ -87,19 +90,30 @@ def _merge_coco(
     path.parent.mkdir()
     info: dict[str, Any] = {"description": dataset, "sequences": {}}
     categories: dict[int, dict[str, Any]] = {}
-    first_image: dict[str, int] = {}
-    images = annotations = 0
-    with path.open("w", encoding="utf-8") as out:
+    images = annotations = 0  # written so far
+    with (
+        path.open("w", encoding="utf-8") as out,
+        tempfile.TemporaryFile("w+", encoding="utf-8", dir=path.parent) as later,
+    ):
         out.write('{"images":[')
         for name, folder in exports.items():
             content = _load(folder / "annotations.json")
-            first_image[name] = images
             facts = {key: value for key, value in content["info"].items() if key != "by_frame"}
             info["sequences"][name] = facts
+            class_of = {}
             for category in content["categories"]:
-                number = _category(category["name"], numbers)
+                number = class_of[category["id"]] = _category(category["name"], numbers)
                 categories[number] = {**category, "id": number}
-            entries = [
+            labels = [
+                {
+                    **entry,
+                    "id": annotations + entry["id"],
+                    "image_id": images + entry["image_id"],
+                    "category_id": class_of[entry["category_id"]],
+                }
+                for entry in content["annotations"]
+            ]
+            pictures = [
                 {
                     **image,
                     "id": images + image["id"],
@@ -108,24 +122,12 @@ def _merge_coco(
                 }
                 for image in content["images"]
             ]
-            images = _write_entries(out, entries, images)
+            _write_entries(later, annotations, labels)
+            _write_entries(out, images, pictures)
+            images, annotations = images + len(pictures), annotations + len(labels)
         out.write('],"annotations":[')
-        for name, folder in exports.items():
-            content = _load(folder / "annotations.json")
-            class_of = {
-                category["id"]: _category(category["name"], numbers)
-                for category in content["categories"]
-            }
-            entries = [
-                {
-                    **entry,
-                    "id": annotations + entry["id"],
-                    "image_id": first_image[name] + entry["image_id"],
-                    "category_id": class_of[entry["category_id"]],
-                }
-                for entry in content["annotations"]
-            ]
-            annotations = _write_entries(out, entries, annotations)
+        later.seek(0)
+        shutil.copyfileobj(later, out)
         out.write(f'],"categories":{_dense([categories[n] for n in sorted(categories)])}')
         out.write(f',"info":{_dense(info)}}}\n')
 
@@ -139,11 +141,10 @@ def _category(name: str, numbers: Mapping[str, int]) -> int:
     return 1 if name == "person" else 1 + numbers[name]
 
 
-def _write_entries(out: TextIO, entries: Sequence[Mapping[str, Any]], before: int) -> int:
-    """Append entries to a list that has ``before`` of them; returns their new number."""
+def _write_entries(out: TextIO, before: int, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Append entries to a list that has ``before`` of them."""
     for place, entry in enumerate(entries, before):
         out.write(("," if place else "") + _dense(entry))
-    return before + len(entries)
 
 
 def _merge_bop(folder: Path, exports: Mapping[str, Path], numbers: Mapping[str, int]) -> None:

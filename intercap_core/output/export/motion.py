@@ -38,9 +38,7 @@ class Motion:
     object_: str
     """Name of the object, "" without one."""
     gender: str
-    """Gender of the body file."""
     fps: float
-    """Frames per second."""
     model: BodyModel
     parameters: BodyParameters
     """Body parameters of the T frames in ``frame``."""
@@ -171,7 +169,6 @@ class Coordinates:
 
     @classmethod
     def of(cls, motion: Motion, units: str = METRES) -> Coordinates:
-        """Return the coordinates of a motion."""
         return cls(motion.frame, motion.up, units)
 
     @property
@@ -183,7 +180,6 @@ class Coordinates:
         return "none: see the vector up" if np.isfinite(self.up).all() else "unknown"
 
     def to_json(self) -> dict[str, Any]:
-        """Serialize for JSON."""
         return {
             "frame": self.frame,
             "up_axis": self.up_axis,
@@ -192,13 +188,8 @@ class Coordinates:
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Serialize for npz files."""
-        return {
-            "frame": np.array(self.frame),
-            "up_axis": np.array(self.up_axis),
-            "up": self.up.astype(np.float64),
-            "units": np.array(self.units),
-        }
+        arrays = {key: np.array(value) for key, value in self.to_json().items()}
+        return arrays | {"up": self.up.astype(np.float64)}
 
     def header_lines(self) -> list[str]:
         """Serialize for the header of a text file, one entry per line."""

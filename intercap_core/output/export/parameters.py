@@ -9,28 +9,32 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.output.export.about import About
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion
 
 NUM_HAND_COMPONENTS = 12  # of a hand's pose in the InterCap release (SMPLify-X's default)
 
 
-def write_amass(folder: Path, motion: Motion, about: About) -> None:
-    """Write ``body.npz`` and, with an object, ``object.npz`` into the new ``folder``.
+def _write_amass(folder: Path, content: Content) -> Coordinates:
+    """Write ``body.npz`` and, with an object, ``object.npz``.
 
     Equal input gives equal bytes: numpy stores the year 1980 as the date of every entry.
     """
-    folder.mkdir()
+    motion, about = content.viewed, content.about
     coordinates = Coordinates.of(motion)
-    np.savez(
-        folder / "body.npz",
-        allow_pickle=False,
-        **{**about.to_arrays(coordinates), **amass_body(motion)},
-    )
-    if motion.has_object:
-        facts = {**about.per_frame_arrays(), **coordinates.to_arrays()}
-        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion), **facts)
+    arrays = about.to_arrays(coordinates) | amass_body(motion)
+    np.savez(folder / "body.npz", allow_pickle=False, **arrays)
+    if motion.has_object:  # x = rotation[t] @ vertex + translation[t], metres
+        arrays = {
+            "object": np.array(motion.object_),
+            "mocap_frame_rate": np.array(motion.fps),
+            "rotation": motion.rotation,
+            "translation": motion.translation,
+            **about.per_frame_arrays(),
+            **coordinates.to_arrays(),
+        }
+        np.savez(folder / "object.npz", allow_pickle=False, **arrays)
+    return coordinates
 
 
 def amass_body(motion: Motion) -> dict[str, np.ndarray]:
@@ -54,27 +58,19 @@ def amass_body(motion: Motion) -> dict[str, np.ndarray]:
     }
 
 
-def object_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Return the object in the same frame: x = rotation[t] @ vertex + translation[t], metres."""
-    return {
-        "object": np.array(motion.object_),
-        "mocap_frame_rate": np.array(motion.fps),
-        "rotation": motion.rotation,
-        "translation": motion.translation,
-    }
-
-
-def write_intercap(path: Path, motion: Motion, about: About) -> None:
+def _write_intercap(folder: Path, content: Content) -> Coordinates:
     """Write the InterCap release's pickle (protocol 4) with an entry ``about``, and an npz file.
 
     Equal input gives equal bytes. In both files, facts about every frame are arrays.
     """
-    values, coordinates = intercap_result(motion), Coordinates.of(motion)
+    about, coordinates = content.about, Coordinates.of(content.motion)
+    values = intercap_result(content.motion)
     facts = about.to_json(coordinates) | {"by_frame": about.per_frame_arrays()}
-    with path.open("wb") as file:
+    with (folder / "res.pkl").open("wb") as file:
         _OldNamesPickler(file, protocol=4).dump({**values, "about": facts})
     arrays = {key: np.asarray(value) for key, value in values.items()}
-    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.to_arrays(coordinates))
+    np.savez(folder / "res.npz", allow_pickle=False, **arrays, **about.to_arrays(coordinates))
+    return coordinates
 
 
 def intercap_result(motion: Motion) -> dict[str, Any]:
@@ -92,7 +88,7 @@ def intercap_result(motion: Motion) -> dict[str, Any]:
             "ob_trans": list(motion.translation.astype(np.float32)),
         }
     hands = {
-        f"{side}_hand_pose": hand_components(motion, index)
+        f"{side}_hand_pose": _hand_components(motion, index)
         for index, side in enumerate(("left", "right"))
     }
     return {
@@ -111,7 +107,7 @@ def intercap_result(motion: Motion) -> dict[str, Any]:
     }
 
 
-def hand_components(motion: Motion, side: int) -> np.ndarray:
+def _hand_components(motion: Motion, side: int) -> np.ndarray:
     """Return the PCA coefficients (T, 12), relative to the mean pose, nearest to a hand's pose.
 
     ``side``: 0 = left, 1 = right.
@@ -138,17 +134,6 @@ class _OldNamesPickler(pickle._Pickler):  # the C pickler offers no hook for nam
         old = module.replace("numpy._core.", "numpy.core.")
         self.write(pickle.GLOBAL + f"{old}\n{obj.__name__}\n".encode())  # type: ignore[attr-defined]
         self.memoize(obj)  # type: ignore[attr-defined]
-
-
-def _write_amass(folder: Path, content: Content) -> Coordinates:
-    write_amass(folder / "amass", content.viewed, content.about)
-    return Coordinates.of(content.viewed)
-
-
-def _write_intercap(folder: Path, content: Content) -> Coordinates:
-    (folder / "intercap").mkdir()
-    write_intercap(folder / "intercap" / "res.pkl", content.motion, content.about)
-    return Coordinates.of(content.motion)
 
 
 _AMASS_README = """
@@ -183,7 +168,6 @@ FORMATS = (
         path="*/export/amass/body.npz and object.npz",
         content="AMASS keys",
         includes="*/export/amass/*.npz",
-        media_type="application/octet-stream",
         readme=_AMASS_README,
         write=_write_amass,
         holds_parameters=True,
@@ -193,7 +177,6 @@ FORMATS = (
         path="*/export/intercap/res.pkl and res.npz",
         content="as the InterCap release",
         includes="*/export/intercap/*",
-        media_type="application/octet-stream",
         readme=_INTERCAP_README,
         write=_write_intercap,
         holds_parameters=True,

@@ -21,8 +21,10 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.flags import PARTS
 from intercap_core.output.export.format import Content, ExportFormat
 from intercap_core.output.export.motion import Coordinates, Motion, posed_batches, rest_pose
+from intercap_core.output.export.parameters import amass_body
 
 FPS = 30.0  # frames per second that both programs assume
+_GMR = ("gender", "mocap_frame_rate", "betas", "root_orient", "pose_body", "trans")  # as in AMASS
 # Columns of InterMimic's tensors (T, 591); holosoma reads these three
 _WIDTH = 591
 _POSITIONS, _OBJECT, _OBJECT_CONTACT = slice(162, 318), slice(318, 325), 330
@@ -68,21 +70,18 @@ class Resampled:
         others = _interpolate(at, np.arange(last + 1), rest)
         vector = torch.as_tensor(np.concatenate([turned.reshape(count, -1), others], 1))
         parameters = BodyParameters.from_vector(vector, num_betas=motion.model.num_betas)
-        rotation = np.full((count, 3, 3), np.nan)
-        translation = np.full((count, 3), np.nan)
+        nothing = np.full((count, 3, 3), np.nan)
+        moved = replace(
+            motion, fps=FPS, parameters=parameters, rotation=nothing, translation=nothing[..., 0]
+        )
         object_poses = None
         if motion.has_object:
             known = np.flatnonzero(np.isfinite(motion.translation).all(axis=1))
-            object_turn = _interpolate_rotations(
-                at, known, Rotation.from_matrix(motion.rotation[known])
-            )
-            rotation = object_turn.as_matrix()
+            turn = _interpolate_rotations(at, known, Rotation.from_matrix(motion.rotation[known]))
             translation = _interpolate(at, known, motion.translation[known])
-            quaternion = object_turn.as_quat(canonical=True, scalar_first=True)
+            moved = replace(moved, rotation=turn.as_matrix(), translation=translation)
+            quaternion = turn.as_quat(canonical=True, scalar_first=True)
             object_poses = np.concatenate([quaternion, translation], 1)
-        moved = replace(
-            motion, fps=FPS, parameters=parameters, rotation=rotation, translation=translation
-        )
         return cls(moved, at, object_poses)
 
     def to_arrays(self, content: Content) -> dict[str, np.ndarray]:
@@ -90,7 +89,7 @@ class Resampled:
         flags = content.about.flags
         arrays: dict[str, Any] = {
             **Coordinates.of(self.motion).to_arrays(),
-            **{key: np.array(value) for key, value in content.about.body.to_json().items()},
+            **content.about.body.to_arrays(),
             "source_frame": self.source_frame,
             "flag_part": np.array(PARTS),
             "flagged": flags.flagged[np.rint(self.source_frame).astype(int)],
@@ -102,16 +101,10 @@ class Resampled:
             }
         return arrays
 
-    def joints(self) -> np.ndarray:
-        """Return the body's joints (N, 55, 3), metres."""
-        posed = posed_batches(self.motion.model, self.motion.parameters)
-        return np.concatenate([batch.joints.numpy() for batch in posed])
-
 
 def _interpolate(at: np.ndarray, frames: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Interpolate (K, D) values of ``frames`` (K,) at (N,) places; constant beyond the ends."""
-    columns = [np.interp(at, frames, column) for column in values.T]
-    return np.stack(columns, axis=1)
+    return np.stack([np.interp(at, frames, column) for column in values.T], axis=1)
 
 
 def _interpolate_rotations(at: np.ndarray, frames: np.ndarray, values: Rotation) -> Rotation:
@@ -124,47 +117,36 @@ def _interpolate_rotations(at: np.ndarray, frames: np.ndarray, values: Rotation)
 def _write_gmr(folder: Path, content: Content) -> Coordinates:
     resampled = Resampled.of(content.z_up)
     motion = resampled.motion
-    values = motion.parameters
-    (folder / "gmr").mkdir()
-    np.savez(
-        folder / "gmr" / f"{motion.sequence}.npz",
-        allow_pickle=False,
-        **{
-            **resampled.to_arrays(content),
-            "gender": np.array(motion.gender),
-            "mocap_frame_rate": np.array(motion.fps),
-            "betas": values.betas[0].numpy().astype(np.float32),
-            "root_orient": values.global_orient.numpy().astype(np.float32),
-            "pose_body": values.body_pose.numpy().astype(np.float32),
-            "trans": values.transl.numpy().astype(np.float32),
-            "left_hand_pose": values.left_hand_pose.numpy().astype(np.float32),
-            "right_hand_pose": values.right_hand_pose.numpy().astype(np.float32),
-        },
-    )
+    body = amass_body(motion)
+    left, right = np.split(body["pose_hand"], 2, axis=1)
+    arrays = {
+        **resampled.to_arrays(content),
+        **{name: body[name] for name in _GMR},
+        "left_hand_pose": left,
+        "right_hand_pose": right,
+    }
+    np.savez(folder / f"{motion.sequence}.npz", allow_pickle=False, **arrays)
     return Coordinates.of(motion)
 
 
 def _write_holosoma(folder: Path, content: Content) -> Coordinates:
     resampled = Resampled.of(content.z_up)
-    motion, joints = resampled.motion, resampled.joints()
+    motion = resampled.motion
+    posed = posed_batches(motion.model, motion.parameters)
+    joints = np.concatenate([batch.joints.numpy() for batch in posed])  # (N, 55, 3)
     vertices, _ = rest_pose(motion.model, motion.parameters)
-    to = folder / "holosoma"
-    to.mkdir()
-    np.savez(
-        to / f"{motion.sequence}.npz",
-        allow_pickle=False,
-        **{
-            **resampled.to_arrays(content),
-            "fps": np.array(motion.fps),
-            "global_joint_positions": joints[:, BODY_JOINTS].astype(np.float32),
-            "height": np.array(np.ptp(vertices[:, 1])),
-        },
-    )
+    arrays = {
+        **resampled.to_arrays(content),
+        "fps": np.array(motion.fps),
+        "global_joint_positions": joints[:, BODY_JOINTS].astype(np.float32),
+        "height": np.array(np.ptp(vertices[:, 1])),
+    }
+    np.savez(folder / f"{motion.sequence}.npz", allow_pickle=False, **arrays)
     if resampled.object_poses is not None and content.mesh is not None:
-        torch.save(_intermimic(resampled, joints, content), to / f"{motion.sequence}.pt")
+        torch.save(_intermimic(resampled, joints, content), folder / f"{motion.sequence}.pt")
         mesh = trimesh.Trimesh(content.mesh.vertices, content.mesh.faces, process=False)
         text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=6)
-        (to / f"{motion.object_}.obj").write_text(f"{text}\n", encoding="utf-8")
+        (folder / f"{motion.object_}.obj").write_text(f"{text}\n", encoding="utf-8")
     return Coordinates.of(motion)
 
 
@@ -204,20 +186,16 @@ holosoma/*.obj      the object's mesh, metres
 FORMATS = (
     ExportFormat(
         name="gmr",
-        path="*/export/gmr",
         content="SMPL-X parameters and object poses at 30 Hz, as GMR reads them",
         includes="*/export/gmr/*.npz",
-        media_type="application/octet-stream",
         readme=_GMR_README,
         write=_write_gmr,
         holds_parameters=True,
     ),
     ExportFormat(
         name="holosoma",
-        path="*/export/holosoma",
         content="joint positions and object poses at 30 Hz, as holosoma (OmniRetarget) reads them",
         includes="*/export/holosoma/*",
-        media_type="application/octet-stream",
         readme=_HOLOSOMA_README,
         write=_write_holosoma,
     ),

@@ -33,13 +33,13 @@ _SKIN, _CONTACT = (184, 153, 133), (220, 40, 40)  # sRGB
 _CONTACT_RADIUS = 0.003  # metres, of the points that mark touching vertices
 
 
-def write(path: Path, content: Content) -> None:
-    """Write the recording."""
+def _write(folder: Path, content: Content) -> Coordinates:
     import rerun as rr
 
-    recording = rr.RecordingStream("intercap-core", recording_id=content.motion.sequence)
-    recording.save(path, default_blueprint=_layout(content))
-    about = content.about.to_json_text(Coordinates.of(content.viewed))
+    sequence, coordinates = content.motion.sequence, Coordinates.of(content.viewed)
+    recording = rr.RecordingStream("intercap-core", recording_id=sequence)
+    recording.save(folder / f"{sequence}.rrd", default_blueprint=_layout(content))
+    about = content.about.to_json_text(coordinates)
     recording.log("about", rr.TextDocument(about, media_type="application/json"), static=True)
     up = rr.ViewCoordinates.RIGHT_HAND_Z_UP if content.is_z_up else rr.ViewCoordinates.RDF
     recording.log("world", up, static=True)
@@ -56,6 +56,7 @@ def write(path: Path, content: Content) -> None:
             recording.log(f"errors/{verdict.stated[part].part}", rr.Scalars(errors[t]))
     recording.flush()
     recording.disconnect()
+    return coordinates
 
 
 def _layout(content: Content) -> Any:
@@ -166,12 +167,6 @@ def _log_camera(recording: Any, content: Content, number: int) -> None:
         recording.log(f"{entity}/image", encoded)
 
 
-def _write(folder: Path, content: Content) -> Coordinates:
-    (folder / "rrd").mkdir()
-    write(folder / "rrd" / f"{content.motion.sequence}.rrd", content)
-    return Coordinates.of(content.viewed)
-
-
 _README = """
 rrd/*.rrd           recording for the Rerun viewer: body{{ ", object, contact" if mesh }}, cameras,
     undistorted JPEG images of at most 640 columns, estimated errors (millimetres)
@@ -181,10 +176,8 @@ rrd/*.rrd           recording for the Rerun viewer: body{{ ", object, contact" i
 FORMATS = (
     ExportFormat(
         name="rrd",
-        path="*/export/rrd",
         content="body, object, contact, images and estimated errors for the Rerun viewer",
         includes="*/export/rrd/*.rrd",
-        media_type="application/octet-stream",
         readme=_README,
         write=_write,
         reads_images=True,

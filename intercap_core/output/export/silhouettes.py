@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from intercap_core.disk import DiskList
@@ -38,16 +39,14 @@ class Mask:
 
     @property
     def area(self) -> int:
-        """Number of set pixels."""
         return int(np.count_nonzero(self.pixels))
 
     def box(self) -> list[int]:
         """Return x, y, width, height of the set pixels; all -1 (BOP's convention) if none is."""
-        rows, columns = (np.flatnonzero(self.pixels.any(axis)) for axis in (1, 0))
-        if not len(rows):
+        if not self.pixels.any():
             return [-1, -1, -1, -1]
-        x, y = int(columns[0]) + self.x0, int(rows[0]) + self.y0
-        return [x, y, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1]
+        x, y, width, height = cv2.boundingRect(self.pixels.astype(np.uint8))
+        return [x + self.x0, y + self.y0, width, height]
 
     def rle(self, camera: Camera) -> bytes:
         """Encode as COCO's compressed run lengths of the whole image."""

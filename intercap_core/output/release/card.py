@@ -11,7 +11,6 @@ import html
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from intercap_core.evaluation.verdict.figures import mean_stated, stated_errors
 from intercap_core.flags import PARTS
 from intercap_core.output.export.registry import formats as export_formats
 from intercap_core.output.release.datasheet import statements, text_templates
-from intercap_core.output.site.measures import covered
+from intercap_core.output.site.measures import covered, made_by_stage
 from intercap_core.versions import versions
 
 Facts = dict[str, Any]
@@ -57,10 +56,6 @@ CONVENTIONS = {
     "flagged parts that you use",
     "errors": "estimated without ground truth, by cameras held out; the factor gives a range that "
     "contains most true errors",
-}
-MERGED_FORMATS = {  # files and content of the exports of all sequences as one
-    "bop": ("export/bop", "bop of all sequences as one dataset with the split test"),
-    "coco": ("export/coco/annotations.json", "coco of all sequences as one file"),
 }
 
 
@@ -122,23 +117,24 @@ def facts(
 
 def _formats(names: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return files and content of exported formats, and of merged ones, by name."""
+    exported = [format_ for name, format_ in export_formats().items() if name in names]
     described = {
-        name: {"path": format_.path, "content": format_.content}
-        for name, format_ in export_formats().items()
-        if name in names
+        format_.name: {"path": format_.files, "content": format_.content} for format_ in exported
     }
     merged = {
-        f"{name}_merged": {"path": path, "content": content}
-        for name, (path, content) in MERGED_FORMATS.items()
-        if name in names
-    }
+        f"{format_.name}_merged": {
+            "path": format_.files.removeprefix("*/"), "content": format_.merged
+        }
+        for format_ in exported
+        if format_.merged
+    }  # fmt: skip
     return described | merged
 
 
 def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) -> pd.DataFrame:
     """Return one row per sequence with its part of both splits, "" for none."""
     measured = [s.metrics for s in summaries]
-    by_subject, by_object = _splits(measured, settings)
+    by_subject, by_object = ({} if why else parts for parts, why in _splits(measured, settings))
     return pd.DataFrame(
         [
             {
@@ -146,8 +142,8 @@ def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) ->
                 "subject": s.subject,
                 "object": s.object_,
                 "frames": len(s),
-                "by_subject": "" if by_subject.why else by_subject.of(s.subject),
-                "by_object": "" if by_object.why else by_object.of(s.object_),
+                "by_subject": by_subject.get(s.subject, ""),
+                "by_object": by_object.get(s.object_, ""),
             }
             for s in measured
         ],
@@ -269,48 +265,31 @@ def _bodies(summaries: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
 def _split_to_json(
     split_: Split, measured: Sequence[SequenceMetrics], attribute: str
 ) -> dict[str, Any]:
-    entries: dict[str, Any] = {"why_not": split_.why}
-    for part, groups in (("train", split_.train), ("test", split_.test)):
+    parts, why = split_
+    entries: dict[str, Any] = {"why_not": why}
+    for part in (TRAIN, TEST):
+        groups = [group for group, own in parts.items() if own == part]
         members = [s for s in measured if getattr(s, attribute) in groups]
         frames = sum(len(s) for s in members)
-        entries[part] = {"groups": list(groups), "sequences": len(members), "frames": frames}
+        entries[part] = {"groups": groups, "sequences": len(members), "frames": frames}
     return entries
 
 
 def _stages(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
     """Count sequences by stage, schema version and digest of settings."""
-    counts: dict[str, Counter[tuple[int, str]]] = {}
-    for s in summaries:
-        for stage, made in s.made_by.items():
-            counts.setdefault(stage, Counter())[made] += 1
     return {
         stage: [
-            {"version": version, "settings": digest, "sequences": count}
-            for (version, digest), count in counted.most_common()
+            {"version": version, "settings": digest, "sequences": len(names)}
+            for version, digest, names in entries
         ]
-        for stage, counted in counts.items()
+        for stage, entries in made_by_stage(summaries).items()
     }
 
 
 TRAIN, TEST = "train", "test"
-
-
-@dataclass(frozen=True)
-class Split:
-    """Groups (subjects or objects) for training and for test."""
-
-    train: tuple[str, ...]
-    """Groups for training, sorted."""
-    test: tuple[str, ...]
-    """Groups for test, sorted."""
-    why: str = ""
-    """Why there is no split, "" if there is one."""
-
-    def of(self, group: str) -> str:
-        """Return the part of a group; "" without a group."""
-        if not group:
-            return ""
-        return TEST if group in self.test else TRAIN
+Split = tuple[dict[str, str], str]
+"""Part (TRAIN or TEST) of each group (subject or object), and why there is no split; "" if there is
+one. Without a split, all groups are for training."""
 
 
 def split(frames: Mapping[str, int], *, share: float, named: Sequence[str] = ()) -> Split:
@@ -325,23 +304,21 @@ def split(frames: Mapping[str, int], *, share: float, named: Sequence[str] = ())
         named: groups to choose instead; unknown names are ignored.
     """
     groups = sorted(frames, key=lambda name: hashlib.sha256(name.encode()).digest())
-    if named:
-        test = {name for name in named if name in frames}
-        why = "" if test else f"none of {', '.join(named)} has a sequence"
-        if test == set(frames):
-            test, why = set(), "all groups would be held out"
-        return _of(frames, test, why)
-    if len(groups) < 2 or share <= 0:
-        why = "there is only one group" if len(groups) == 1 else "there is no group"
-        return _of(frames, set(), why if share > 0 else "the share of the test part is 0")
-    goal, total, test = share * sum(frames.values()), 0, set()
-    for name in groups:
-        remaining = len(groups) - len(test) > 1
-        if remaining and abs(total + frames[name] - goal) < abs(total - goal):
-            test.add(name)
-            total += frames[name]
-    return _of(frames, test or {min(groups, key=frames.__getitem__)}, "")
-
-
-def _of(frames: Mapping[str, int], test: set[str], why: str) -> Split:
-    return Split(tuple(sorted(set(frames) - test)), tuple(sorted(test)), why)
+    test, why = {name for name in named if name in frames}, ""
+    if named and not test:
+        why = f"none of {', '.join(named)} has a sequence"
+    elif named and test == set(frames):
+        test, why = set(), "all groups would be held out"
+    elif not named and share <= 0:
+        why = "the share of the test part is 0"
+    elif not named and len(groups) < 2:
+        why = "there is only one group" if groups else "there is no group"
+    elif not named:
+        goal, total = share * sum(frames.values()), 0
+        for name in groups:
+            remaining = len(groups) - len(test) > 1
+            if remaining and abs(total + frames[name] - goal) < abs(total - goal):
+                test.add(name)
+                total += frames[name]
+        test = test or {min(groups, key=frames.__getitem__)}
+    return {name: TEST if name in test else TRAIN for name in sorted(frames)}, why

@@ -40,10 +40,6 @@ _CONTEXT = {
     "examples": {"@id": "cr:examples", "@type": "@json"},
     **{name: f"cr:{name}" for name in _TERMS},
 }
-_MERGED_FILES = {  # glob of the merged exports, whose media type is that of the format
-    "bop": "export/bop/**/*.json",
-    "coco": "export/coco/annotations.json",
-}
 
 
 def croissant(card: Facts, folder: Path, tables: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
@@ -90,13 +86,13 @@ def _table_file(folder: Path, name: str) -> dict[str, Any]:
 
 def _file_set(name: str) -> dict[str, Any]:
     format_ = formats()[name.removesuffix("_merged")]
-    is_merged = name.endswith("_merged")
     return {
         "@type": "cr:FileSet",
         "@id": name,
         "name": name,
         "encodingFormat": format_.media_type,
-        "includes": _MERGED_FILES[format_.name] if is_merged else format_.includes,
+        # one folder for each sequence, but for merged exports
+        "includes": format_.includes.removeprefix("*/" if name.endswith("_merged") else ""),
     }
 
 

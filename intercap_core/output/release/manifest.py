@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -32,22 +32,6 @@ class ReleasedFile:
     """One of KINDS."""
     bytes: int
     sha256: str
-
-
-@dataclass(frozen=True)
-class Differences:
-    """Paths that differ between a folder and its manifest."""
-
-    missing: list[str] = field(default_factory=list)
-    """Listed files that do not exist."""
-    changed: list[str] = field(default_factory=list)
-    """Listed files with another size or checksum."""
-    unknown: list[str] = field(default_factory=list)
-    """Files that the manifest does not list."""
-
-    def __bool__(self) -> bool:
-        """True if a listed file is missing or changed; unknown files do not count."""
-        return bool(self.missing or self.changed)
 
 
 def kind_of(path: PurePosixPath) -> str | None:
@@ -104,11 +88,12 @@ def write(
     return entries
 
 
-def check(folder: Path, *, threads: int = 1) -> tuple[int, Differences]:
+def check(folder: Path, *, threads: int = 1) -> tuple[int, dict[str, list[str]]]:
     """Compare a dataset's ``folder`` with its release.json.
 
-    Returns the number of listed files and the differences. Raises UserError if release.json is
-    missing or broken.
+    Returns the number of listed files, and the paths that are "missing", that are "changed" in size
+    or checksum, and that are "not in the list". Raises UserError if release.json is missing or
+    broken.
     """
     listed = _read(folder / MANIFEST)
 
@@ -117,22 +102,21 @@ def check(folder: Path, *, threads: int = 1) -> tuple[int, Differences]:
         exists = path.is_file()
         same = exists and path.stat().st_size == entry.bytes and _digest(path) == entry.sha256
         progress.step()
-        return "" if same else "changed" if exists else "missing"
+        return "as released" if same else "changed" if exists else "missing"
 
     progress = Progress(log, "checked", len(listed), "files")
     states = ThreadPool(threads).map(compare, listed)
-    differing: dict[str, list[str]] = {"missing": [], "changed": []}
-    for entry, state in zip(listed, states, strict=True):
-        if state:
-            differing[state].append(entry.path)
-    known = {entry.path for entry in listed}
-    kinds = {entry.kind for entry in listed}
-    unknown = [
+    found = {
+        state: [entry.path for entry, own in zip(listed, states, strict=True) if own == state]
+        for state in ("missing", "changed")
+    }
+    known, kinds = {entry.path for entry in listed}, {entry.kind for entry in listed}
+    found["not in the list"] = [
         path.as_posix()
         for path, kind in _files(folder)
         if kind in kinds and path.as_posix() not in known
     ]
-    return len(listed), Differences(differing["missing"], differing["changed"], unknown)
+    return len(listed), found
 
 
 def _files(folder: Path) -> list[tuple[PurePosixPath, str]]:
@@ -171,10 +155,8 @@ def _read(path: Path) -> list[ReleasedFile]:
                 "version of this program that wrote it"
             )
         entries = [
-            ReleasedFile(
-                str(file["path"]), str(file["kind"]), int(file["bytes"]), str(file["sha256"])
-            )
-            for file in content["files"]
+            ReleasedFile(str(f["path"]), str(f["kind"]), int(f["bytes"]), str(f["sha256"]))
+            for f in content["files"]
         ]
     except FileNotFoundError:
         raise UserError(

@@ -100,8 +100,8 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
     slip[2:, 1] = 1
     image_of = images_of_moments(slip, np.ones((total, 3), bool))
     scenes = Scenes(motion, capture.rig, capture.mesh, image_of, times, late, np.zeros((0, 0, 3)))
-    bop.write(tmp_path / "bop", scenes, 9, exported.plain_about(motion), masks=False)
-    path = tmp_path / "bop" / "test" / "000001"
+    bop.write(tmp_path, exported.content(scenes, capture.object_, masks=False))
+    path = tmp_path / "test" / "000001"
     assert sorted(file.name for file in path.iterdir()) == [
         f"scene_{kind}.json" for kind in ("about", "camera", "gt")
     ]

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from intercap_core.config import ExportSettings
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.output.export import images
+from intercap_core.output.export.format import Content
 from intercap_core.output.export.silhouettes import Scenes
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -77,6 +79,7 @@ def written(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Pa
         folder / "frames.h5", rig, num_sets=1, depths=depths, colours=[[kind] for kind in kinds]
     )
     nothing: Any = None
+    settings = ExportSettings()
     image_of, times = np.zeros((1, 2), int), np.zeros(1)
     for undistort in (False, True):
         shown = images.undistorted(rig) if undistort else rig
@@ -84,7 +87,10 @@ def written(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Pa
         with Frames.open(path) as frames:
             names = images.name_images(frames, scenes)
             assert names == [{0: "000000.png"}, {0: "000000.jpg"}]
-            images.write(folder / str(undistort), frames, rig, scenes, names, {"bop", "coco"})
+            content = Content(
+                nothing, np.eye(4), nothing, settings, nothing, scenes, rig, None, frames, names
+            )
+            images.write(folder / str(undistort), content, {"bop", "coco"})
     for name, kind in zip(("grid/000000.png", "separate/000000.jpg"), kinds, strict=True):
         assert (folder / "False" / "coco" / name).read_bytes() == kind
     return {undistort: folder / str(undistort) for undistort in (False, True)}

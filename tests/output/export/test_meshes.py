@@ -13,6 +13,7 @@ from intercap_core import artefacts
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.output.export import meshes
 from intercap_core.output.export.motion import read_motion
+from intercap_core.output.export.silhouettes import Scenes
 from intercap_core.schemas import JOINT
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -78,8 +79,11 @@ def test_frames_without_an_object_pose_have_no_object_mesh(
 ) -> None:
     motion = read_motion(capture.paths["joint"], 15.0, fitted.BODY_MODELS, "neutral")
     motion.translation[1] = np.nan
-    about, mesh = exported.plain_about(motion), capture.mesh if with_object else None
-    meshes.write(tmp_path, motion, bodies, mesh, about, kind="ply", every=1)
+    scenes = Scenes(
+        motion, capture.rig, capture.mesh if with_object else None, np.zeros((4, 3), int),
+        np.arange(4) / 15, np.zeros(3), bodies,
+    )  # fmt: skip
+    meshes.write(tmp_path, exported.content(scenes, capture.object_))
     objects = [f"{t:05d}_second_obj.ply" for t in (0, 2, 3) if with_object]
     expected = sorted([*(f"{t:05d}_second.ply" for t in range(4)), *objects])
     assert sorted(path.name for path in (tmp_path / "Mesh").iterdir()) == expected

@@ -19,6 +19,7 @@ FILES = {
     "s01/export/amass/body.npz": "export", "s01/joint.h5": "artefact",
     "s02/joint.h5": "artefact", "s01/export/a name, with spaces.txt": "export",
 }  # fmt: skip
+STATES = ("missing", "changed", "not in the list")
 OTHERS = ("recordings/s01/truth.h5", "recordings/s01/k1.mkv", ".snakemake/log", "s01/.x.part")
 
 
@@ -36,7 +37,7 @@ def test_every_file_of_the_dataset_is_listed_and_no_other(folder: Path) -> None:
     assert {entry.path: entry.kind for entry in entries} == FILES
     content = json.loads((folder / "release.json").read_text())
     assert content["dataset"] == "demo" and len(content["files"]) == len(FILES)
-    assert manifest.check(folder) == (len(FILES), manifest.Differences())
+    assert manifest.check(folder) == (len(FILES), {state: [] for state in STATES})
     first = (folder / "release.json").read_bytes()
     manifest.write(folder, {"dataset": "demo"})  # the lists do not list themselves
     assert (folder / "release.json").read_bytes() == first
@@ -61,7 +62,8 @@ def test_differences_are_classified(folder: Path) -> None:
     (folder / "tables" / "new.csv").write_text("")
     (folder / "site" / "new.html").write_text("")  # of a kind that was not released
     _, differences = manifest.check(folder)
-    assert differences == manifest.Differences(["README.md"], ["s02/joint.h5"], ["tables/new.csv"])
+    expected = (["README.md"], ["s02/joint.h5"], ["tables/new.csv"])
+    assert differences == dict(zip(STATES, expected, strict=True))
     assert differences
 
 
