@@ -19,7 +19,7 @@ from intercap_core.output.release.card import Facts
 from intercap_core.output.release.datasheet import rai_fields
 
 CONFORMS_TO = ["http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0"]
-_TEXT = "sc:Text"
+_TYPES = {"b": "sc:Boolean", "i": "sc:Integer", "u": "sc:Integer", "f": "sc:Float"}  # of numpy
 _TERMS = (
     "citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format",
     "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet",
@@ -107,7 +107,7 @@ def _records(name: str, table: pd.DataFrame) -> dict[str, Any]:
                 "@type": "cr:Field",
                 "@id": f"{name}/{column}",
                 "name": f"{name}/{column}",
-                "dataType": _data_type(table[column]),
+                "dataType": _TYPES.get(table[column].dtype.kind, "sc:Text"),
                 "source": {
                     "fileObject": {"@id": f"{name}.csv"},
                     "extract": {"column": str(column)},
@@ -116,11 +116,3 @@ def _records(name: str, table: pd.DataFrame) -> dict[str, Any]:
             for column in table.columns
         ],
     }
-
-
-def _data_type(values: pd.Series) -> str:
-    if pd.api.types.is_bool_dtype(values):
-        return "sc:Boolean"
-    if pd.api.types.is_integer_dtype(values):
-        return "sc:Integer"
-    return "sc:Float" if pd.api.types.is_float_dtype(values) else _TEXT

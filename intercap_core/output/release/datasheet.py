@@ -8,7 +8,6 @@ results tell is filled in; what only its authors know are statements of the sett
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,31 +18,20 @@ from intercap_core.config import CardSettings
 Facts = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Statement:
-    """What only the authors of a dataset can state."""
-
-    question: str
-    """What the text should answer."""
-    if_virtual: str = ""
-    """Its text for a dataset of virtual recordings if the settings state none."""
-
-
-STATEMENTS = {  # by name of the setting in `card`
-    "licence": Statement("Under which licence may the data be used?"),
-    "collection": Statement(
-        "Who recorded whom, where, when, with which devices and instructions, and for what pay?",
-        "The recordings were rendered by the virtual studio of intercap-core.",
-    ),
-    "consent": Statement(
-        "How did the recorded persons consent, to which uses, how can they withdraw, and which "
-        "ethics board approved it?",
-        "No person was recorded: the recordings are virtual.",
-    ),
-    "uses": Statement("For which tasks is the data meant, and for which should it not be used?"),
-    "biases": Statement("Which groups of people, objects and actions are rare or absent?"),
-    "social_impact": Statement("What good and harm can come from the data's use?"),
-    "maintenance": Statement("Who maintains the data, and where are errors reported?"),
+STATEMENTS = {  # questions that only the authors of a dataset can answer, by setting in `card`
+    "licence": "Under which licence may the data be used?",
+    "collection": "Who recorded whom, where, when, with which devices and instructions, and for "
+    "what pay?",
+    "consent": "How did the recorded persons consent, to which uses, how can they withdraw, and "
+    "which ethics board approved it?",
+    "uses": "For which tasks is the data meant, and for which should it not be used?",
+    "biases": "Which groups of people, objects and actions are rare or absent?",
+    "social_impact": "What good and harm can come from the data's use?",
+    "maintenance": "Who maintains the data, and where are errors reported?",
+}
+_IF_VIRTUAL = {  # answers for a dataset of virtual recordings if the settings state none
+    "collection": "The recordings were rendered by the virtual studio of intercap-core.",
+    "consent": "No person was recorded: the recordings are virtual.",
 }
 
 
@@ -54,8 +42,8 @@ def statements(settings: CardSettings, *, virtual: bool) -> dict[str, str]:
         virtual: all recordings are virtual.
     """
     return {
-        name: getattr(settings, name).strip() or (statement.if_virtual if virtual else "")
-        for name, statement in STATEMENTS.items()
+        name: getattr(settings, name).strip() or (_IF_VIRTUAL.get(name, "") if virtual else "")
+        for name in STATEMENTS
     }
 
 
@@ -73,7 +61,7 @@ def text_templates() -> jinja2.Environment:
 def datasheet(card: Facts) -> str:
     """Return the datasheet as Markdown; missing statements are placeholders with their question."""
     stated = {
-        name: text or f"**Not stated.** {STATEMENTS[name].question} (setting `card.{name}`)"
+        name: text or f"**Not stated.** {STATEMENTS[name]} (setting `card.{name}`)"
         for name, text in card["statements"].items()
     }
     return (

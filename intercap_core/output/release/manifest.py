@@ -122,14 +122,12 @@ def check(folder: Path, *, threads: int = 1) -> tuple[int, dict[str, list[str]]]
 def _files(folder: Path) -> list[tuple[PurePosixPath, str]]:
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; run the project first, or name another folder")
-    files = []
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and not path.is_symlink():
-            relative = PurePosixPath(path.relative_to(folder).as_posix())
-            kind = kind_of(relative)
-            if kind is not None:
-                files.append((relative, kind))
-    return files
+    files = [
+        PurePosixPath(path.relative_to(folder).as_posix())
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.is_symlink()
+    ]
+    return [(path, kind) for path in files if (kind := kind_of(path)) is not None]
 
 
 def _sequence_of(path: PurePosixPath, kind: str) -> str | None:

@@ -42,9 +42,9 @@ def test_a_datasheet_has_the_statements_or_their_questions(folders: dict[str, Pa
     full = (folders["stated"] / "datasheet.md").read_text()
     empty = (folders["empty"] / "datasheet.md").read_text()
     assert "Not stated" not in full
-    for name, statement in STATEMENTS.items():
+    for name, question in STATEMENTS.items():
         assert getattr(CARD, name) in full
-        assert f"**Not stated.** {statement.question} (setting `card.{name}`)" in empty
+        assert f"**Not stated.** {question} (setting `card.{name}`)" in empty
 
 
 def test_croissant_has_the_responsible_ai_fields(folders: dict[str, Path]) -> None:
