@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,9 @@ def write(folder: Path, content: Content) -> Coordinates:
         scene = scene_folder(folder, number)
         scene.mkdir(parents=True, exist_ok=True)
         poses = scenes.poses[number]
-        _dump(scene / "scene_camera.json", scene_camera(camera, list(poses)))
-        _dump(scene / "scene_gt.json", scene_gt(camera, poses, obj_id))
+        cameras, objects = _scene(camera, poses, obj_id)
+        _dump(scene / "scene_camera.json", cameras)
+        _dump(scene / "scene_gt.json", objects)
         lenses[scene.name] = {"camera": camera.name, **scenes.lens_of(number)}
         info: dict[str, Any] = {}
         if content.settings.masks:
@@ -119,37 +120,30 @@ def _write_masks(scene: Path, drawn: Silhouettes, camera: Camera) -> dict[str, A
     }
 
 
-def scene_camera(camera: Camera, images: Sequence[int]) -> dict[str, Any]:
-    """Return the lens and pose of each image.
+def _scene(
+    camera: Camera, poses: Mapping[int, np.ndarray], obj_id: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return scene_camera.json, lens and pose of each image, and scene_gt.json, the object's poses.
 
     ``cam_K`` is in pixels, row by row. The world is the master camera's frame, in millimetres.
-    """
-    pose = camera.colour_from_master
-    entry = {
-        "cam_K": camera.colour.matrix.ravel().tolist(),
-        "depth_scale": 1.0,
-        "cam_R_w2c": pose[:3, :3].ravel().tolist(),
-        "cam_t_w2c": (1e3 * pose[:3, 3]).tolist(),
-    }
-    return {str(image): entry for image in images}
-
-
-def scene_gt(camera: Camera, poses: Mapping[int, np.ndarray], obj_id: int) -> dict[str, Any]:
-    """Return colour_from_object of each image, translations in millimetres.
 
     Args:
         poses: master_from_object (4, 4) by image number.
     """
-    in_camera = {image: camera.colour_from_master @ pose for image, pose in poses.items()}
+    colour_from_master = camera.colour_from_master
+    lens = {"cam_K": camera.colour.matrix.ravel().tolist(), "depth_scale": 1.0}
+    lens |= _pose(colour_from_master, "w2c")
+    objects = {
+        str(image): [{**_pose(colour_from_master @ pose, "m2c"), "obj_id": obj_id}]
+        for image, pose in poses.items()
+    }
+    return {str(image): lens for image in poses}, objects
+
+
+def _pose(pose: np.ndarray, name: str) -> dict[str, Any]:
     return {
-        str(image): [
-            {
-                "cam_R_m2c": pose[:3, :3].ravel().tolist(),
-                "cam_t_m2c": (1e3 * pose[:3, 3]).tolist(),
-                "obj_id": obj_id,
-            }
-        ]
-        for image, pose in in_camera.items()
+        f"cam_R_{name}": pose[:3, :3].ravel().tolist(),
+        f"cam_t_{name}": (1e3 * pose[:3, 3]).tolist(),
     }
 
 

@@ -38,15 +38,12 @@ def _write(folder: Path, content: Content) -> Coordinates:
 def table(stated: StatedContact) -> str:
     """Format as tab-separated text with a row per frame and region."""
     labels = {1: "1", 0: "0", -1: ""}
-    rows = ["frame\tregion\tprobability\tannotated"]
-    for t, (probability, annotated) in enumerate(
-        zip(stated.probability, stated.annotated, strict=True)
-    ):
-        rows += [
-            f"{t}\t{region}\t{p:.4f}\t{labels[int(label)]}"
-            for region, p, label in zip(stated.regions, probability, annotated, strict=True)
-        ]
-    return "\n".join(rows) + "\n"
+    rows = [
+        f"{t}\t{region}\t{p:.4f}\t{labels[int(label)]}\n"
+        for t, frame in enumerate(zip(stated.probability, stated.annotated, strict=True))
+        for region, p, label in zip(stated.regions, *frame, strict=True)
+    ]
+    return "frame\tregion\tprobability\tannotated\n" + "".join(rows)
 
 
 def draft(stated: StatedContact) -> str:
