@@ -202,13 +202,9 @@ def _window(
     pixels = lens.project(points)
     low, high = pixels.min(0), pixels.max(0)
     middle, size = (low + high) / 2, (high - low) * 1.2
-    width = max(size[0], size[1] * 0.6)
-    height = max(size[1], size[0] / 1.6)
-    x0, y0 = (
-        int(max(0, np.floor(m - s / 2))) for m, s in zip(middle, (width, height), strict=True)
-    )
-    x1 = int(min(lens.width, np.ceil(middle[0] + width / 2)))
-    y1 = int(min(lens.height, np.ceil(middle[1] + height / 2)))
+    half = np.array([max(size[0], size[1] * 0.6), max(size[1], size[0] / 1.6)]) / 2
+    x0, y0 = np.maximum(0, np.floor(middle - half)).astype(int).tolist()
+    x1, y1 = np.minimum([lens.width, lens.height], np.ceil(middle + half)).astype(int).tolist()
     if x1 - x0 < 8 or y1 - y0 < 8:
         return None
     return x0, y0, x1 - x0, y1 - y0
