@@ -298,9 +298,8 @@ def patches_of(points, normals, size):
 
 @numba.njit(cache=True, nogil=True)
 def seen_patches(
-    depth, face, x0, y0, mask, mx, my, rays, picture, light,
-    object_from_camera, face_normals, size, steep,
-):  # fmt: skip
+    depth, face, corner, mask, rays, picture, light, object_from_camera, face_normals, size, steep
+):
     """Return the patches of all pixels that show the object, with faces and colours.
 
     The loop runs over the pixels of the rendering. A pixel counts if it and its four neighbours lie
@@ -308,8 +307,8 @@ def seen_patches(
     surface too oblique. Its depth gives the surface point, and so the patch.
 
     Args:
-        depth, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.
-        mask: the candidate's mask, whose first pixel is (mx, my).
+        depth, face: (h, w) of the rendering, whose first pixel is ``corner`` of the image.
+        mask: the candidate's mask (:attr:`.reduced_mask.ReducedMask.placed`).
         rays: (H, W, 2) of the lens.
         picture: (H, W, 3) uint8 BGR.
         light: (256,) logarithms of light of grey levels, NaN if too dark or saturated.
@@ -332,24 +331,23 @@ def seen_patches(
             f = face[v, u]
             if f < 0:
                 continue
-            blue = light[picture[y0 + v, x0 + u, 0]]
-            green = light[picture[y0 + v, x0 + u, 1]]
-            red = light[picture[y0 + v, x0 + u, 2]]
+            x, y = corner[0] + u, corner[1] + v
+            blue, green = light[picture[y, x, 0]], light[picture[y, x, 1]]
+            red = light[picture[y, x, 2]]
             if np.isnan(blue + green + red):
                 continue
             inside = True
             for a, b in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
-                i, j = u + b + x0 - mx, v + a + y0 - my
-                inside &= face[v + a, u + b] >= 0 and covers(mask, i, j)
+                inside &= face[v + a, u + b] >= 0 and covers(mask, x + b, y + a)
             if not inside:
                 continue
             z = depth[v, u]
-            x, y = rays[y0 + v, x0 + u, 0] * z, rays[y0 + v, x0 + u, 1] * z
+            px, py = rays[y, x, 0] * z, rays[y, x, 1] * z
             across, length = 0.0, 0.0
             for axis in range(3):
                 along = (
-                    object_from_camera[axis, 0] * x
-                    + object_from_camera[axis, 1] * y
+                    object_from_camera[axis, 0] * px
+                    + object_from_camera[axis, 1] * py
                     + object_from_camera[axis, 2] * z
                 )
                 point[axis] = along + object_from_camera[axis, 3]

@@ -41,10 +41,8 @@ def absent_track(frames: int, cameras: int) -> dict[str, np.ndarray]:
 def track_datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndarray]:
     """Return all datasets but ``camera_names`` of a track.
 
-    Args:
-        track: the track.
-        cameras: indices in the rig of the cameras with views.
-        count: number of cameras of the rig; cameras without a view have -1 and NaN.
+    ``cameras`` are the indices of the cameras with views in the rig of ``count`` cameras. Cameras
+    without a view have -1 and NaN.
     """
     frames = track.frames
     shape = (len(frames), count)

@@ -52,7 +52,7 @@ class Gap:
     """(T, 4, 4) poses of the track."""
     times: np.ndarray
     """(T,) seconds."""
-    joints: np.ndarray | None
+    joints: np.ndarray
     """(T, K, 3) of the person, metres, NaN where unknown."""
     frames: np.ndarray
     """(N,) the lost frames."""
@@ -72,7 +72,7 @@ class Gap:
     def bridges(self) -> list[Bridge]:
         """Return the possible paths: straight, and with each hand that may have held the object."""
         a, b = self.step
-        hands = [] if self.joints is None else estimate_hand_motions(self.joints[[a, b]])
+        hands = estimate_hand_motions(self.joints[[a, b]])
         seconds = abs(float(self.times[b] - self.times[a]))
         modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], seconds, hands)
         rest, free, *in_hand = modes[:, 0, 0]
@@ -117,7 +117,6 @@ class Gap:
         grow with the time to the nearer known frame, and with the distance from the wrist. None if
         the motion of the hand is unknown.
         """
-        assert self.joints is not None
         forwards, backwards = (
             estimate_hand_motions(self.joints[[u, t]])[hand] for u in (self.before, self.after)
         )
@@ -163,12 +162,8 @@ class FilledTrack:
 def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> FilledTrack:
     """Fill in the lost frames of a track by the likeliest path between known frames.
 
-    Known poses are replaced by equivalent ones that follow each other.
-
-    Args:
-        observer: the recording.
-        poses: (T, 4, 4) of the track.
-        lost: (T,) bool.
+    Known ``poses`` (T, 4, 4) are replaced by equivalent ones that follow each other. ``lost`` (T,)
+    bool.
     """
     count, symmetry, known, times = len(poses), observer.mesh.symmetry, ~lost, observer.times
     track = unwrap_symmetry(symmetry, poses, known)

@@ -20,7 +20,7 @@ import numpy as np
 
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.appearance import LIGHT, Appearance, SurfaceColours, seen_patches
-from intercap_core.object_track.decoder import HIDDEN, Decoded, decode_given, mix_decisions
+from intercap_core.object_track.decoder import HIDDEN, Decoded, MarkovModel, mix_decisions
 from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import RIVAL_PROBABILITY, Hypotheses
@@ -32,24 +32,18 @@ from intercap_core.object_track.view_report import choose_candidate
 class ColourDecision:
     """Decides again between hypotheses that colours distinguish."""
 
-    def __init__(self, observer: Observer, hypotheses: Hypotheses, absent: float) -> None:
-        """``absent`` is the argument of :func:`.decoder.decode`, nats per frame."""
+    def __init__(self, observer: Observer, hypotheses: Hypotheses) -> None:
         self._observer = observer
         self._hypotheses = hypotheses
-        self._absent = absent
         # metres: patches of a cup are 1 cm, two pixels at 3 m; tuned on the studio
         self._patch_size = observer.mesh.diameter / 12
         self._seen: dict[tuple[int, int], SurfaceColours | None] = {}
         self._pictures: tuple[int, list[np.ndarray | None]] | None = None
 
-    def decide(
-        self, emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], decoded: Decoded
-    ) -> Decoded:
+    def decide(self, model: MarkovModel, decoded: Decoded) -> Decoded:
         """Return the decision with the evidence of colours, or ``decoded`` if they cannot help.
 
-        Args:
-            emissions, steps: arguments of :func:`.decoder.decode`.
-            decoded: its result without colours.
+        ``decoded`` is the result of the ``model``, which has no colours.
         """
         sure = np.array(
             [
@@ -63,7 +57,7 @@ class ColourDecision:
         own = decoded.probability[first][:-1]
         # gauges: up to three likely hypotheses of the reference frame
         gauges = [int(k) for k in np.argsort(-own)[:3] if own[k] > RIVAL_PROBABILITY]
-        relative = {k: decode_given(emissions, steps, first, k, self._absent) for k in gauges}
+        relative = {k: model.decode_given(first, k) for k in gauges}
         rivals = self._ambiguous(list(relative.values()))
         if not gauges or (not rivals and (self._observer.paint is None or len(gauges) == 1)):
             return decoded
@@ -72,10 +66,10 @@ class ColourDecision:
         if any(learnt[k] is None and own[k] > 0.05 for k in gauges):
             return decoded
         known = {k: colours for k, colours in learnt.items() if colours is not None}
-        every = self._add_colours(emissions, list(known.values()), rivals)
+        every = self._add_colours(model.emissions, list(known.values()), rivals)
         results = []
         for (k, colours), values in zip(known.items(), every, strict=True):
-            again = decode_given(values, steps, first, k, self._absent)
+            again = replace(model, emissions=values).decode_given(first, k)
             # wrong colours are wrong in all frames, so all frames count as three observations
             paint = 3 * float(np.mean([colours.paint_log_ratio(s) for s in colours.sightings]))
             results.append(replace(again, evidence=again.evidence + paint))
@@ -172,8 +166,7 @@ class ColourDecision:
             if picture is None or candidate is None:
                 continue
             patch, face, colour = seen_patches(
-                drawn.depth, drawn.face, drawn.x0, drawn.y0,
-                candidate.mask.mask, candidate.mask.x0, candidate.mask.y0,
+                drawn.depth, drawn.face, (drawn.x0, drawn.y0), candidate.mask.placed,
                 shot.lens.rays, picture, LIGHT, np.linalg.inv(shot.camera_from_mesh),
                 mesh.face_normals, self._patch_size, steep_cosine,
             )  # fmt: skip

@@ -45,9 +45,7 @@ def step_log_ratios(
     """Return log-probabilities of the steps between the hypotheses of two frames.
 
     Args:
-        mesh: the object.
-        before: (K, 4, 4) poses.
-        after: (L, 4, 4) poses.
+        before, after: (K, 4, 4) and (L, 4, 4) poses.
         seconds: time between the frames.
         hands: motions of the H hands, None if unknown. A hand must be near enough to hold the
             object.
@@ -145,33 +143,45 @@ class Decoded:
     """Log-likelihood of all frames, relative to the object being in none."""
 
 
-def decode(
-    emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], absent: float = 0.0
-) -> Decoded:
-    """Decode the states of T frames.
+@dataclass(frozen=True)
+class MarkovModel:
+    """Log-likelihoods of the states of T frames and of the steps between them."""
 
-    Args:
-        emissions: [T] (K_t,) log-likelihoods of the hypotheses, relative to that none is true.
-        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) of :func:`step_log_ratios`. Hidden states have no
-            mode; the entries of the first mode count for them.
-        absent: nats per frame by which having left is likelier than being hidden. An object in the
-            room is seldom hidden from all cameras for long.
-    """
-    modes = len(steps[0]) if steps else 1
-    states = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
-    states[0][:-2] -= np.log(modes)  # all modes are equally likely in the first frame
-    for end in (0, -1):
-        states[end][-1] -= VANISH_COST
-    transitions = [_transitions(step) for step in steps]
-    path = np.array(_viterbi(states, transitions)) // modes
-    path[path >= [len(own) for own in emissions]] = HIDDEN
-    posterior, evidence = _forward_backward(states, transitions)
-    return Decoded(
-        path,
-        [np.append(own[:-2].reshape(-1, modes).sum(1), own[-2] + own[-1]) for own in posterior],
-        np.array([own[-1] for own in posterior]),
-        evidence,
-    )
+    emissions: Sequence[np.ndarray]
+    """[T] (K_t,) log-likelihoods of the hypotheses, relative to that none is true."""
+    steps: Sequence[np.ndarray]
+    """[T - 1] (M, M, K_t + 1, K_t+1 + 1) of :func:`step_log_ratios`. Hidden states have no mode;
+    the entries of the first mode count for them."""
+    absent: float = 0.0
+    """Nats per frame by which having left is likelier than being hidden. An object in the room is
+    seldom hidden from all cameras for long."""
+
+    def decode(self) -> Decoded:
+        """Return the probabilities and the most likely sequence of the states."""
+        modes = len(self.steps[0]) if self.steps else 1
+        states = [np.append(np.repeat(own, modes), [0.0, self.absent]) for own in self.emissions]
+        states[0][:-2] -= np.log(modes)  # all modes are equally likely in the first frame
+        for end in (0, -1):
+            states[end][-1] -= VANISH_COST
+        transitions = [_transitions(step) for step in self.steps]
+        path = np.array(_viterbi(states, transitions)) // modes
+        path[path >= [len(own) for own in self.emissions]] = HIDDEN
+        posterior, evidence = _forward_backward(states, transitions)
+        return Decoded(
+            path,
+            [np.append(own[:-2].reshape(-1, modes).sum(1), own[-2] + own[-1]) for own in posterior],
+            np.array([own[-1] for own in posterior]),
+            evidence,
+        )
+
+    def decode_given(self, frame: int, state: int) -> Decoded:
+        """Decode given that hypothesis ``state`` of ``frame`` is true."""
+        certain = 1e4  # nats: far more than the evidence of all frames
+        known = list(self.emissions)
+        known[frame] = np.full(len(known[frame]), -certain)
+        known[frame][state] = self.emissions[frame][state] + certain
+        decoded = replace(self, emissions=known).decode()
+        return replace(decoded, evidence=decoded.evidence - certain)
 
 
 def _transitions(step: np.ndarray) -> np.ndarray:
@@ -229,22 +239,6 @@ def _forward_backward(
         backward.append(beta / beta.max())
     both = [alpha * beta for alpha, beta in zip(forward, reversed(backward), strict=True)]
     return [own / own.sum() for own in both], evidence
-
-
-def decode_given(
-    emissions: Sequence[np.ndarray],
-    steps: Sequence[np.ndarray],
-    frame: int,
-    state: int,
-    absent: float = 0.0,
-) -> Decoded:
-    """Decode as :func:`decode`, given that hypothesis ``state`` of ``frame`` is true."""
-    certain = 1e4  # nats: far more than the evidence of all frames
-    known = list(emissions)
-    known[frame] = np.full(len(known[frame]), -certain)
-    known[frame][state] = emissions[frame][state] + certain
-    decoded = decode(known, steps, absent)
-    return replace(decoded, evidence=decoded.evidence - certain)
 
 
 def mix_decisions(results: Sequence[Decoded]) -> Decoded:

@@ -124,12 +124,8 @@ def without_turns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Remove the evidence on ``steps`` (N, 6), which the facets of a round mesh seem to give.
 
-    For each step s, information H becomes H - H s s^T H / (s^T H s), so that H s = 0.
-
-    Args:
-        information: (..., 6, 6).
-        gradient: (..., 6).
-        steps: (N, 6) of :func:`free_turns`.
+    For each step s of :func:`free_turns`, information H (..., 6, 6) becomes
+    H - H s s^T H / (s^T H s), so that H s = 0. ``gradient`` (..., 6).
     """
     for step in steps:
         row = information @ step

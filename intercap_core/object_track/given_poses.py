@@ -38,11 +38,6 @@ class GivenPose:
     sigma_rad: float
     """Standard deviation of the turn about each axis, radians."""
 
-    def squared_distances(self, mesh: ObjectMesh, poses: np.ndarray) -> np.ndarray:
-        """Return squared distances (K,) of poses (K, 4, 4), in standard deviations."""
-        turn, shift = pose_distances(mesh, self.pose[None], poses)
-        return np.asarray((turn[0] / self.sigma_rad) ** 2 + (shift[0] / self.sigma_m) ** 2)
-
     def holds(self, mesh: ObjectMesh, pose: np.ndarray) -> bool:
         """Return whether a pose (4, 4) agrees with this one.
 
@@ -88,12 +83,8 @@ class GivenEvidence:
         annotated frame. All carried frames of one annotated pose together count as one observation,
         since they depend on one unknown velocity.
 
-        Args:
-            mesh: the object.
-            given: annotated poses.
-            poses: (T, 4, 4) of the track.
-            unseen: (T,) frames whose images do not show the object.
-            times: (T,) seconds.
+        ``poses`` (T, 4, 4) are those of the track, ``unseen`` (T,) frames whose images do not show
+        the object.
         """
         reference, information = poses.copy(), np.zeros((len(poses), 6, 6))
         annotated = {pose.frame: pose for pose in given}
@@ -121,10 +112,8 @@ class GivenEvidence:
         These are the frames of segments that no other frame sees, and of segments in which an
         annotated pose disagrees with the nearest observed pose.
 
-        Args:
-            mesh: the object.
-            poses: (T, 4, 4) of the track.
-            segment: (T,) number of the rest segment, -1 while the object moves.
+        ``poses`` (T, 4, 4) are those of the track, ``segment`` (T,) is the number of the rest
+        segment, -1 while the object moves.
         """
         result = np.zeros(len(segment), bool)
         stated = self.carried.copy()
@@ -151,12 +140,7 @@ class GivenEvidence:
 def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the seconds (T,) to the nearest of ``frames`` that is connected by unseen frames.
 
-    It is 0 in ``frames`` themselves, and infinite if no frame is connected.
-
-    Args:
-        frames: frames of annotated poses.
-        unseen: (T,) bool.
-        times: (T,) seconds.
+    It is 0 in ``frames`` themselves, and infinite if no frame is connected. ``unseen`` (T,) bool.
     """
     result = np.full(len(unseen), np.inf)
     for frame in frames:
@@ -176,13 +160,8 @@ def flag_edges(
 
     An object that moves out of sight there moves fast: a swung racquet moves by a decimetre in
     19 ms, a possible time offset of a view. The unseen side does not constrain its velocity, so
-    that the pose at the frame's time is less certain than the covariance states.
-
-    Args:
-        fits: fit of each frame.
-        unseen: (T,) bool.
-        frames: frames of annotated poses.
-        times: (T,) seconds.
+    that the pose at the frame's time is less certain than the covariance states. ``fits`` are those
+    of all T frames, ``unseen`` (T,) bool.
     """
     since = np.abs(times[:, None] - times[list(frames)]).min(1, initial=np.inf)
     padded = np.pad(unseen, 1)

@@ -82,11 +82,12 @@ class Prior:
             result += UPRIGHT_LOG_RATIO * np.array([fit.pose[:3, 2] @ up for fit in fits])
         if t in self.given and fits:
             poses = np.array([fit.pose for fit in fits])
-            _, shift = pose_distances(mesh, self.given[t].pose[None], poses)
-            squared = self.given[t].squared_distances(mesh, poses)
+            given = self.given[t]
+            (turn,), (shift,) = pose_distances(mesh, given.pose[None], poses)
+            squared = (turn / given.sigma_rad) ** 2 + (shift / given.sigma_m) ** 2
             near = np.maximum(JUMP_COST - 0.5 * squared, 0.0)
             # all poses nearby outweigh a jump there and back for this frame alone
-            result += (3 * JUMP_COST * (shift[0] < ANNOTATED_REACH_M) + near) / share
+            result += (3 * JUMP_COST * (shift < ANNOTATED_REACH_M) + near) / share
         return result
 
 

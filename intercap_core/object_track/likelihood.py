@@ -51,8 +51,6 @@ def log_ratio(
     """Return the log-likelihood ratio of a pose in one view, nats.
 
     Args:
-        context: object and settings.
-        view: the view.
         pose: (4, 4) master_from_object.
         silhouette, drawn_depth: renderings of the pose in the colour and the depth image; the
             latter None without depth.
@@ -79,7 +77,6 @@ def _depth(
     assert view.depth is not None and geometry.depth_lens is not None
     colour_from_depth = geometry.camera.colour_from_depth
     assert colour_from_depth is not None
-    person = view.person
     mask = candidate.mask if candidate is not None else EMPTY
     likely_sigma_m = 0.008  # of depth from the mesh: sensor, calibration, mesh
     background_m = 0.025  # three standard deviations of depth from the empty room
@@ -91,11 +88,11 @@ def _depth(
     if view.background is not None:
         room = view.background[drawn.window]
     total, count = depth_log_ratio(
-        drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth[drawn.window], room,
+        drawn.depth, drawn.face, (drawn.x0, drawn.y0), view.depth[drawn.window], room,
         geometry.depth_lens.rays, mesh.face_normals,
         geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
-        person.mask, person.x0, person.y0, mask.mask, mask.x0, mask.y0,
+        view.person.placed, mask.placed,
         likely_sigma_m, background_m, clutter_m, log_past, log_hidden, mesh.diameter,
     )  # fmt: skip
     return VIEW_SAMPLES * total / (count + DEPTH_HALF_SAMPLES_PX)
@@ -113,12 +110,10 @@ def _mask(
     if candidate is None:
         return missed
     lens, step = view.geometry.lens, view.geometry.step
-    mask, person = candidate.mask, view.person
     # a pixel costs at most 4.5, as three standard deviations
     cost, count = outline_cost(
-        silhouette.face, silhouette.x0, silhouette.y0, mask.mask, mask.x0, mask.y0,
-        person.mask, person.x0, person.y0, lens.width, lens.height,
-        max(CONTOUR_SIGMA_PX / step, 1.0), 4.5,
+        silhouette.face, (silhouette.x0, silhouette.y0), candidate.mask.placed, view.person.placed,
+        lens.width, lens.height, max(CONTOUR_SIGMA_PX / step, 1.0), 4.5,
     )  # fmt: skip
     samples = VIEW_SAMPLES * count / (count + 60)  # half of them at 60 pixels
     named = 0.0
@@ -130,8 +125,8 @@ def _mask(
 
 @numba.njit(cache=True, nogil=True)
 def depth_log_ratio(
-    rendered, face, x0, y0, measured, background, rays, face_normals, rotation,
-    colour_from_depth, colour, person, px, py, mask, mx, my,
+    rendered, face, corner, measured, background, rays, face_normals, rotation,
+    colour_from_depth, colour, person, mask,
     sigma, background_m, clutter_m, log_past, log_hidden, diameter,
 ):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
@@ -144,13 +139,13 @@ def depth_log_ratio(
     front of the object, it contradicts the pose, because the object does not lie in the floor.
 
     Args:
-        rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the depth image.
+        rendered, face: (h, w) of the rendering, whose first pixel is ``corner`` of the depth image.
         measured: (h, w) depth in metres, 0 where invalid.
         background: (h, w) depth of the empty room, 0 where unknown; or (0, 0).
         rays: (H, W, 2) of the depth lens.
         face_normals, rotation: (F, 3) unit normals and (3, 3) depth camera_from_object.
         colour_from_depth, colour: (4, 4), and (13,) parameters of the colour lens.
-        person, mask: masks with their first pixels (px, py), (mx, my) in the colour image.
+        person, mask: masks of the colour image (:attr:`.reduced_mask.ReducedMask.placed`).
         sigma: standard deviation of depth from the surface, metres.
         background_m: largest difference from the empty room at which depth shows the room, metres.
         clutter_m: range in which other surfaces are measured uniformly, metres.
@@ -172,7 +167,8 @@ def depth_log_ratio(
                 continue
             count += 1
             gap = z - rendered[v, u]
-            rx, ry = rays[y0 + v, x0 + u, 0], rays[y0 + v, x0 + u, 1]
+            i, j = corner[0] + u, corner[1] + v
+            rx, ry = rays[j, i, 0], rays[j, i, 1]
             nx, ny, nz = rotated_normal(face_normals, f, rotation)
             across = gap * (nx * rx + ny * ry + nz) / sigma
             shown = agrees - 0.5 * across * across
@@ -182,9 +178,9 @@ def depth_log_ratio(
             cx, cy, cz = transform_point(colour_from_depth, rx * z, ry * z, z)
             column, row = project_point(cx, cy, cz, colour)
             x, y = int(np.rint(column)), int(np.rint(row))
-            if covers(mask, x - mx, y - my):
+            if covers(mask, x, y):
                 total += max(shown, log_hidden)
-            elif not covers(person, x - px, y - py):
+            elif not covers(person, x, y):
                 known = background[v, u] if background.size else np.float32(0.0)
                 is_room = known > 0 and abs(known - z) <= background_m
                 if not is_room or (shown < 0 and gap > -diameter):
@@ -193,17 +189,18 @@ def depth_log_ratio(
 
 
 @numba.njit(cache=True, nogil=True)
-def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigma, most):
+def outline_cost(face, corner, mask, person, width, height, sigma, most):
     """Compare the outlines of a rendering and a mask.
 
     The nearest pixel of the other outline is searched exactly for each pixel of either outline.
     Mask pixels farther from the rendering's window than half of its size are ignored. Pixels next
     to a person outside of the mask, or at the edge of the image, do not count: the outline may be
-    cut off there. Windows are given with their first pixels (x, y) in the image.
+    cut off there.
 
     Args:
         face: (h, w) face number of the rendering, -1 outside.
-        mask, person: masks.
+        corner: first pixel (x, y) of the rendering in the image.
+        mask, person: masks (:attr:`.reduced_mask.ReducedMask.placed`).
         width, height: size of the image.
         sigma: standard deviation of an outline, pixels.
         most: largest cost of a pixel.
@@ -214,11 +211,11 @@ def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigm
     """
     h, w = face.shape
     margin = max(h, w) // 2 + 2
-    left, top = x0 - margin, y0 - margin
+    left, top = corner[0] - margin, corner[1] - margin
     rows, columns = h + 2 * margin, w + 2 * margin
-    drawn = cut(face >= 0, margin, margin, 0, 0, rows, columns)
-    inside = cut(mask, mx, my, left, top, rows, columns)
-    other = cut(person, px, py, left, top, rows, columns) & ~inside
+    drawn = cut((face >= 0, margin, margin), 0, 0, rows, columns)
+    inside = cut(mask, left, top, rows, columns)
+    other = cut(person, left, top, rows, columns) & ~inside
     edge, edge_starts = rim_pixels(drawn)
     border, border_starts = rim_pixels(inside)
     limit = sigma * np.sqrt(2 * most)

@@ -79,9 +79,7 @@ class HandMotion:
     def reaches(self, centres: np.ndarray, radius: float) -> np.ndarray:
         """Return whether the hand is near enough to hold an object before the motion, (...) bool.
 
-        Args:
-            centres: (..., 3) of the object, metres.
-            radius: of the object, metres.
+        ``centres`` (..., 3) and ``radius`` are those of the object, metres.
         """
         return np.linalg.norm(centres - self.start, axis=-1) < radius + HOLDING_REACH_M
 
@@ -117,10 +115,7 @@ def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
 def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Replace known poses (T, 4, 4) by symmetric equivalents, each closest to the known one before.
 
-    Args:
-        symmetry: of the object.
-        poses: (T, 4, 4).
-        known: (T,) bool.
+    ``known`` (T,) bool.
     """
     result = poses.copy()
     if not symmetry.trivial:
@@ -135,25 +130,6 @@ def shift_twist(twist: np.ndarray, point: np.ndarray, other: np.ndarray) -> np.n
     ``twist`` (6,) contains the shift of ``point`` (3,), the result that of ``other`` (3,).
     """
     return np.append(twist[:3], twist[3:] + np.cross(twist[:3], other - point))
-
-
-def carry_in_hands(
-    joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: float
-) -> np.ndarray:
-    """Return poses (N, 4, 4) in the next frame of an object in each hand that may hold it.
-
-    Args:
-        joints: (2, K, 3) of the person in this frame and the next, NaN where unknown.
-        now: (4, 4) pose of the object in this frame.
-        centre: (3,) of the object in this frame, metres.
-        radius: of the object, metres.
-    """
-    poses = [
-        hand.carry(now)
-        for hand in estimate_hand_motions(joints)
-        if hand is not None and hand.reaches(centre, radius)
-    ]
-    return np.array(poses).reshape(-1, 4, 4)
 
 
 def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:

@@ -17,7 +17,7 @@ from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.solve.thread_pool import threads_of_job
 from intercap_core.object_track.evidence import ERROR_LASTING_S, ImageEvidence, evidence_at
 from intercap_core.object_track.fit import AT_REST, FittedPose, MotionPrior, assess_all, fit_pose
-from intercap_core.object_track.motion import carry_in_hands
+from intercap_core.object_track.motion import estimate_hand_motions
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.recording import ViewCache
 from intercap_core.object_track.search import rank_frames, search_pose
@@ -44,12 +44,12 @@ class Observer:
     """Settings of stage ``object_track``."""
     times: np.ndarray
     """(T,) of the frames, seconds."""
+    joints: np.ndarray
+    """(T, K, 3) of the person, master frame, NaN where unknown."""
     labels: tuple[str, ...] = ()
     """Detector classes of the object; empty: any but a person."""
     up: np.ndarray | None = None
     """(3,) vertical in the master frame."""
-    joints: np.ndarray | None = None
-    """(T, K, 3) of the person, master frame, NaN where unknown."""
     pictures: Pictures | None = None
     """Colour images of the views."""
     paint: Paint | None = None
@@ -171,10 +171,13 @@ class Observer:
 
     def carried(self, t: int, u: int, pose: np.ndarray) -> np.ndarray:
         """Predict poses (N, 4, 4) of frame u from ``pose`` (4, 4) of frame t, one per near hand."""
-        if self.joints is None:
-            return np.zeros((0, 4, 4))
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
-        return carry_in_hands(self.joints[[t, u]], pose, centre, radius)
+        poses = [
+            hand.carry(pose)
+            for hand in estimate_hand_motions(self.joints[[t, u]])
+            if hand is not None and hand.reaches(centre, radius)
+        ]
+        return np.array(poses).reshape(-1, 4, 4)
 
     def assess(self, t: int, pose: np.ndarray, twist: np.ndarray = AT_REST) -> FittedPose:
         """Compare a pose (4, 4) with frame t without a fit; arguments as in :meth:`fit`."""

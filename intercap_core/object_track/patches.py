@@ -55,11 +55,10 @@ class DepthPatch:
             return None
         colour_from_depth = geometry.camera.colour_from_depth
         assert colour_from_depth is not None
-        person = view.person
         depth, points, trust = _lift(
             view.depth[top:bottom, left:right], lens.rays, left, top, np.asarray(colour_from_depth),
             geometry.camera.master_from_depth, geometry.lens.parameters,
-            mask.mask, mask.x0, mask.y0, person.mask, person.x0, person.y0,
+            mask.placed, view.person.placed,
         )  # fmt: skip
         return cls(left, top, depth, points, trust)
 
@@ -142,16 +141,12 @@ def _own(border, person):
 
 
 @numba.njit(cache=True, nogil=True)
-def _lift(
-    image, rays, left, top, colour_from_depth, master_from_depth, colour,
-    mask, mx, my, person, px, py,
-):  # fmt: skip
+def _lift(image, rays, left, top, colour_from_depth, master_from_depth, colour, mask, person):
     """Compute depth, points and trust of a :class:`DepthPatch`.
 
     ``image`` is a window of the depth image, whose first pixel is (left, top). Each pixel is lifted
-    along its ray and projected into the colour image, whose masks decide its weight. Masks
-    are given with their first pixels, in pixels of the reduced colour lens with parameters
-    ``colour`` (13,).
+    along its ray and projected into the colour image of the reduced lens with parameters ``colour``
+    (13,), whose masks (:attr:`.reduced_mask.ReducedMask.placed`) decide its weight.
     """
     height, width = image.shape
     depth = np.zeros((height, width), np.float32)
@@ -170,8 +165,8 @@ def _lift(
             cx, cy, cz = transform_point(colour_from_depth, x, y, z)
             column, row = project_point(cx, cy, cz, colour)
             i, j = int(np.rint(column)), int(np.rint(row))
-            if covers(mask, i - mx, j - my):
+            if covers(mask, i, j):
                 trust[v, u] = 1.0
-            elif covers(person, i - px, j - py):
+            elif covers(person, i, j):
                 trust[v, u] = 0.0
     return depth, points, trust

@@ -9,7 +9,7 @@ visible in their place while the tracked object is elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class OccupiedPlace:
     """(3,) position, metres, master frame."""
     share: float
     """Share of the surveyed frames in which it was occupied."""
+    prior: float = MIN_PLACE_PRIOR
+    """Prior over the recording that the tracked object is there."""
     rival_frames: set[int] = field(default_factory=set)
     """Frames in which it was occupied while the object was elsewhere."""
 
@@ -44,20 +46,15 @@ class OccupiedPlace:
 class Places:
     """Places where candidates were seen, with the prior that the tracked object is there."""
 
-    def __init__(
-        self, mesh: ObjectMesh, standing: list[OccupiedPlace], joints: np.ndarray | None
-    ) -> None:
-        """Initialise the prior.
+    def __init__(self, mesh: ObjectMesh, standing: list[OccupiedPlace], joints: np.ndarray) -> None:
+        """Initialise the prior from occupied places, whose priors are computed.
 
-        Args:
-            mesh: the object.
-            standing: occupied places.
-            joints: (T, K, 3) of the person, master frame, NaN where unknown; None without a person.
+        ``joints`` (T, K, 3) of the person are in the master frame, NaN where unknown.
         """
         self._reach = 0.5 * mesh.radius  # from the object's centre to its surface, about
         self._same = _same_place_m(mesh)
-        self._joints = None if joints is None else joints[:, :67]  # body and hands, no face
-        self._standing = [(s, self._standing_prior(s)) for s in standing]
+        self._joints = joints[:, :67]  # body and hands, no face
+        self._standing = [replace(s, prior=self._standing_prior(s)) for s in standing]
         # places (3,) of similar objects, each with its log-likelihood ratio by frame
         self._clutter: list[tuple[np.ndarray, dict[int, float]]] = []
         self._others: list[np.ndarray] = []  # places (3,) that annotated poses exclude
@@ -69,19 +66,11 @@ class Places:
         load: Callable[[int], list[View]],
         count: int,
         labels: tuple[str, ...],
-        joints: np.ndarray | None,
+        joints: np.ndarray,
     ) -> tuple[Places, list[int]]:
-        """Survey a few frames of the recording.
+        """Survey a few of the ``count`` frames of the recording, whose views ``load`` returns.
 
-        Args:
-            mesh: the object.
-            load: returns the views of a frame.
-            count: number of frames.
-            labels: detector classes of the object.
-            joints: (T, K, 3) of the person, as in the constructor.
-
-        Returns:
-            The places, and the surveyed frames with candidates, the most promising first.
+        Returns the places, and the surveyed frames with candidates, the most promising first.
         """
         frames = sorted({int(t) for t in np.linspace(0, count - 1, 12).round()})
         seen = []
@@ -106,8 +95,7 @@ class Places:
         nearest = self._nearest(place)
         if nearest is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
-        standing, place_prior = nearest
-        return MIN_PLACE_PRIOR if len(standing.rival_frames) >= 2 else place_prior
+        return MIN_PLACE_PRIOR if len(nearest.rival_frames) >= 2 else nearest.prior
 
     def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
         """Combine the images' evidence for the object at ``place`` (3,) in frame t with its prior.
@@ -120,28 +108,21 @@ class Places:
         3. Elsewhere the object moves: up to ``OTHER_OBJECT_LOG_RATIO`` is subtracted if the person
            is not near.
 
-        Args:
-            t: frame.
-            place: (3,) position, master frame.
-            ratio: log-likelihood ratio of the images, nats.
-            share: independent observations per frame.
-
-        Returns:
-            Log-likelihood ratio with the prior, nats.
+        Returns the log-likelihood ratio with the prior, nats. ``ratio`` is that of the images.
         """
         if self._index(self._others, place) is not None:
             return min(ratio, 0.0) - OTHER_OBJECT_LOG_RATIO
         ratio -= self._clutter_ratio(place)
         nearest = self._nearest(place)
-        if nearest is None or nearest[0].share < SOMETIMES_PRESENT:
+        if nearest is None or nearest.share < SOMETIMES_PRESENT:
             gaps = self._gaps(place, slice(t, t + 1))
             return ratio - (OTHER_OBJECT_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
         prior = min(self.prior(t, place), 1 - 1e-6)
         return min(ratio, float(np.log(prior / (1 - prior))) / share)
 
-    def _nearest(self, place: np.ndarray) -> tuple[OccupiedPlace, float] | None:
-        """Return the known place at ``place`` (3,) and its prior, if any."""
-        index = self._index([s.place for s, _ in self._standing], place)
+    def _nearest(self, place: np.ndarray) -> OccupiedPlace | None:
+        """Return the known place at ``place`` (3,), if any."""
+        index = self._index([s.place for s in self._standing], place)
         return None if index is None else self._standing[index]
 
     def _index(self, places: list[np.ndarray], place: np.ndarray) -> int | None:
@@ -156,24 +137,18 @@ class Places:
         Its place is removed from the known places.
         """
         self._standing = [
-            (s, place_prior)
-            for s, place_prior in self._standing
-            if np.linalg.norm(s.place - place) >= self._same
+            s for s in self._standing if np.linalg.norm(s.place - place) >= self._same
         ]
 
     def add_rival(self, t: int, place: np.ndarray, object_at: np.ndarray, ratio: float) -> None:
-        """Record a similar object in frame t, while the tracked object is elsewhere.
+        """Record a similar object at ``place`` (3,) in frame t, the tracked one at ``object_at``.
 
-        Args:
-            t: frame.
-            place: (3,) position of the similar object.
-            object_at: (3,) position of the tracked object.
-            ratio: log-likelihood ratio of the images for the similar object, nats.
+        ``ratio`` is the images' log-likelihood ratio for the similar object, nats.
         """
         nearest = self._nearest(place)
-        apart = nearest is not None and np.linalg.norm(nearest[0].place - object_at) >= self._same
+        apart = nearest is not None and np.linalg.norm(nearest.place - object_at) >= self._same
         if nearest is not None and apart and ratio > DECISIVE_LOG_RATIO:
-            nearest[0].rival_frames.add(t)
+            nearest.rival_frames.add(t)
         clutter = self._clutter_at(place) or (place, {})
         if np.linalg.norm(clutter[0] - object_at) < self._same:
             return
@@ -226,8 +201,6 @@ class Places:
 
         Frames without known joints are left out.
         """
-        if self._joints is None:
-            return np.zeros(0)
         distance = np.linalg.norm(self._joints[frames] - place, axis=-1)
         nearest = np.where(np.isfinite(distance), distance, np.inf).min(1)
         return np.maximum(nearest[np.isfinite(nearest)] - self._reach, 0.0)

@@ -28,9 +28,14 @@ class ReducedMask:
     mask: np.ndarray
     """(h, w) bool."""
 
+    @property
+    def placed(self) -> tuple[np.ndarray, int, int]:
+        """The three fields in the form in which compiled functions take a mask."""
+        return self.mask, self.x0, self.y0
+
     def window(self, x0: int, y0: int, height: int, width: int) -> np.ndarray:
         """Return the mask in another window of the reduced image, False outside of its own."""
-        return cut(self.mask, self.x0, self.y0, x0, y0, height, width)
+        return cut(self.placed, x0, y0, height, width)
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the mask (N,) at integer reduced pixels x, y (N,)."""
@@ -49,11 +54,12 @@ class ReducedMask:
 
 
 @numba.njit(cache=True, nogil=True)
-def cut(mask, x0, y0, left, top, height, width):
-    """Return a mask (h, w) whose first pixel is (x0, y0) in the window from (left, top).
+def cut(placed, left, top, height, width):
+    """Return a mask (:attr:`ReducedMask.placed`) in the window from (left, top).
 
     The result (height, width) bool is False outside of the mask.
     """
+    mask, x0, y0 = placed
     result = np.zeros((height, width), np.bool_)
     first, last = max(left, x0), min(left + width, x0 + mask.shape[1])
     upper, lower = max(top, y0), min(top + height, y0 + mask.shape[0])
@@ -65,9 +71,11 @@ def cut(mask, x0, y0, left, top, height, width):
 
 
 @numba.njit(cache=True, nogil=True)
-def covers(mask, x, y):
-    """Return whether pixel (x, y) of a mask (h, w) is set; False outside of the window."""
-    return 0 <= x < mask.shape[1] and 0 <= y < mask.shape[0] and mask[y, x]
+def covers(placed, x, y):
+    """Return whether pixel (x, y) of the image is set in a mask (:attr:`ReducedMask.placed`)."""
+    mask, x0, y0 = placed
+    column, row = x - x0, y - y0
+    return 0 <= column < mask.shape[1] and 0 <= row < mask.shape[0] and mask[row, column]
 
 
 EMPTY = ReducedMask(0, 0, np.zeros((0, 0), bool))
@@ -127,16 +135,9 @@ def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: n
 def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedMask | None:
     """Remove the person from a candidate that covers both person and object.
 
-    Slivers along the person's silhouette are discarded.
-
-    Args:
-        mask: the candidate.
-        person: the person's mask.
-        step: reduction of both masks.
-
-    Returns:
-        The largest remaining part. None if the candidate does not cover the person, or nothing
-            else.
+    Slivers along the person's silhouette are discarded. Returns the largest remaining part; None if
+    the candidate does not cover the person, or nothing else. ``step`` is the reduction of both
+    masks.
     """
     least = 0.25 * person.area  # pixels of the person that the candidate covers
     if not person.area or mask.area < least:

@@ -26,15 +26,8 @@ POSE_COST = 9.0  # tuned
 def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Find the frames at rest.
 
-    Frames without evidence rest if those around them rest at one pose.
-
-    Args:
-        evidence: evidence of T frames.
-        times: (T,) seconds.
-        centre: (3,) of the object, object frame.
-
-    Returns:
-        (T,) number of the rest segment from 0, -1 while the object moves.
+    Frames without evidence rest if those around them rest at one pose. Returns the number (T,) of
+    the rest segment from 0, -1 while the object moves. ``centre`` (3,) is that of the object.
     """
     evidence = evidence.about(centre)
     count = len(times)

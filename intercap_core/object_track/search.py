@@ -12,7 +12,7 @@ shrinks from the error of the grid to the noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -55,9 +55,6 @@ def search_pose(
     """Search the pose of a frame set.
 
     Args:
-        context: object and settings.
-        field: distance field of the mesh.
-        views: views of the frame set.
         up: (3,) vertical in the master frame: standing poses are tried more finely.
         place_prior: prior, 0 to 1, of a position (3,).
         rotations: (N, 3, 3) rotations to try; None = a grid of all.
@@ -91,7 +88,7 @@ def search_pose(
         rotations = rotation_grid(mesh.symmetry, up)
     fits: list[FittedPose] = []
     for group in find_groups(mesh, views, context.labels, place_prior):
-        poses = align(mesh, field, group, views, rotations)
+        poses = align(mesh, field, group, rotations)
         poses = poses[distinct_poses(mesh, poses, count=number_compared)]
         of_group = fit_starts(compare(poses)[:number_fitted])
         fits += of_group
@@ -111,11 +108,7 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     """Order the frames for searching.
 
     Frames in which more views have a candidate with a likely label come first. Among equal frames
-    the next one is far from those already ordered.
-
-    Args:
-        labels_by_view: labels [T][C][candidates].
-        labels: detector classes of the object.
+    the next one is far from those already ordered. ``labels_by_view`` [T][C][candidates].
     """
     count = len(labels_by_view)
 
@@ -136,28 +129,15 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
 
 
 def align(
-    mesh: ObjectMesh,
-    field: DistanceField,
-    group: Group,
-    views: Sequence[View],
-    rotations: np.ndarray,
+    mesh: ObjectMesh, field: DistanceField, group: Group, rotations: np.ndarray
 ) -> np.ndarray:
-    """Align rotations to a group of candidates (ICP with successive halving).
+    """Align rotations (N, 3, 3) to a group of candidates (ICP with successive halving).
 
     All rotations start at the position of the group and take seven Gauss-Newton steps together, on
     points and outlines. The worst rotations are dropped after the second and the fourth step. Steps
-    are in the object's frame.
-
-    Args:
-        mesh, field: the object and its distance field.
-        group: candidates of the object.
-        views: views of the frame set.
-        rotations: (N, 3, 3).
-
-    Returns:
-        Poses (M, 4, 4), the best first.
+    are in the object's frame. Returns poses (M, 4, 4), the best first.
     """
-    cloud, eyes = _cloud(group, views)
+    cloud, eyes = _cloud(group)
     few = len(group) <= 2
     shapes = [s.outline for s in group if (few or s.centre is None) and s.outline]
     hull = hull_vertices(mesh) if shapes else np.zeros((0, 3))
@@ -205,7 +185,7 @@ def align(
     return rigid(rotation, translation)
 
 
-def _cloud(group: Group, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+def _cloud(group: Group) -> tuple[np.ndarray, np.ndarray]:
     """Return up to 150 points (P, 3), as many of each view, and their cameras' centres (P, 3)."""
     measured = [s for s in group if len(s.points)]
     if not measured:
@@ -215,7 +195,7 @@ def _cloud(group: Group, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]
         s.points[np.linspace(0, len(s.points) - 1, min(share, len(s.points))).astype(int)]
         for s in measured
     ]
-    centres = [views[s.view].geometry.camera.master_from_depth[:3, 3] for s in measured]
+    centres = [s.image.geometry.camera.master_from_depth[:3, 3] for s in measured]
     eyes = [np.broadcast_to(e, part.shape) for e, part in zip(centres, parts, strict=True)]
     return np.concatenate(parts), np.concatenate(eyes)
 
@@ -231,7 +211,6 @@ def _to_points(
     """Linearise the distances of P points from the surface at N poses, by steps in its own frame.
 
     Args:
-        field: distance field of the mesh.
         cloud, eyes: (P, 3) points and the camera centre of each, master frame.
         rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
         scale: Geman-McClure scale, metres.

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,13 @@ from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import nearest
 from intercap_core.object_track.colour_decision import ColourDecision
-from intercap_core.object_track.decoder import FREE_COST_S, HIDDEN, Decoded, decode, step_log_ratios
+from intercap_core.object_track.decoder import (
+    FREE_COST_S,
+    HIDDEN,
+    Decoded,
+    MarkovModel,
+    step_log_ratios,
+)
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import (
@@ -78,30 +84,21 @@ class Tracker:
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
         self._mesh = observer.mesh
-        joints, times = observer.joints, observer.times
-        self._hands = [
-            [] if joints is None else estimate_hand_motions(joints[[t, t + 1]])
-            for t in range(len(times) - 1)
-        ]
+        count = observer.count
+        self._hands = [estimate_hand_motions(observer.joints[t : t + 2]) for t in range(count - 1)]
         self._prior = Prior(observer)
         self._hypotheses = Hypotheses(observer, self._prior)
         self._proposals = Proposals(observer, self._hypotheses, self._prior)
-        self._absent = observer.share * ABSENT_LOG_RATIO
-        self._colours = ColourDecision(observer, self._hypotheses, self._absent)
-        self._emissions: list[np.ndarray] = []
-        self._steps: list[np.ndarray] = []
+        self._colours = ColourDecision(observer, self._hypotheses)
 
     def run(self, annotated: Sequence[GivenPose] = ()) -> Track:
-        """Track the object.
-
-        Args:
-            annotated: poses that a person annotated; without them the object is searched for.
+        """Track the object from annotated poses; without any, it is searched for.
 
         Raises NotFound if no frame shows a possible object.
         """
         used = [given for given in annotated if self._proposals.add_annotated(given)]
         seed = self._start([given.frame for given in used])
-        decoded = self._search(self._decode())
+        decoded = self._search()
         if self._proposals.add_near_symmetries(decoded):
             decoded = self._decode()
         for _ in range(3):
@@ -109,8 +106,8 @@ class Tracker:
             if not changed:
                 break
             self._proposals.allow_search_near(changed)
-            decoded = self._search(self._decode())
-        decoded = self._colours.decide(self._emissions, self._steps, decoded)
+            decoded = self._search()
+        decoded = self._colours.decide(self._model, decoded)
         if (decoded.path == HIDDEN).all():
             raise NotFound
         frames = self._results(decoded)
@@ -155,8 +152,9 @@ class Tracker:
                 raise
             return annotated[0]
 
-    def _search(self, decoded: Decoded) -> Decoded:
-        """Search uncertain frames and decide again until no hypothesis is new."""
+    def _search(self) -> Decoded:
+        """Decide, search uncertain frames and decide again until no hypothesis is new."""
+        decoded = self._decode()
         for _ in range(15):
             if not self._proposals.search_uncertain(decoded):
                 break
@@ -172,15 +170,19 @@ class Tracker:
         fits = self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
-        self._steps = self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S))
-        self._emissions = [self._observer.share * weight for weight in weights]
-        decoded = decode(self._emissions, self._steps, self._absent)
+        share = self._observer.share
+        self._model = MarkovModel(
+            [share * weight for weight in weights],
+            self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S)),
+            share * ABSENT_LOG_RATIO,
+        )
+        decoded = self._model.decode()
         # near annotated poses of a hidden object any motion is possible
         near = self._prior.near_annotated(decoded.path == HIDDEN)
         if near.any():
             free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
-            self._steps = self._step_log_ratios(poses, free)
-            decoded = decode(self._emissions, self._steps, self._absent)
+            self._model = replace(self._model, steps=self._step_log_ratios(poses, free))
+            decoded = self._model.decode()
         centres = [np.array([self._mesh.centre_at(p) for p in own]).reshape(-1, 3) for own in poses]
         self._update_places(decoded, centres)
         return decoded

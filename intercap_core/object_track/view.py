@@ -75,13 +75,7 @@ class ViewGeometry:
 
         The object is compared at about 80 pixels across in colour and 60 in depth. More cost time
         and carry no more information, since neighbouring pixels of an image err together.
-
-        Args:
-            camera: the camera.
-            diameter_m: diameter of the object, metres.
-            distance_m: usual distance of the object from the camera, metres.
-            depth_bias_m: as the field.
-            time_offset_s: as the field.
+        ``distance_m`` is the usual distance of the object from the camera.
         """
         angle = diameter_m / distance_m
         step = _step(camera.colour.fx, angle, 80)
@@ -108,12 +102,9 @@ class ViewGeometry:
 
 
 def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
-    """Return the median distance of each camera from the person's joints, metres.
+    """Return the median distance of each camera from the person's joints (T, K, 3), metres.
 
-    Args:
-        cameras: C cameras.
-        joints: (T, K, 3) of the person, master frame, NaN where unknown. If no joint is known, all
-            distances are 2.5 m, as usual in a capture ring.
+    If no joint is known (NaN), all distances are 2.5 m, as usual in a capture ring.
     """
     places = joints[np.isfinite(joints).all(-1)]
     if not len(places):
@@ -157,7 +148,6 @@ class View:
 
     def through(self, geometry: ViewGeometry) -> View:
         """Return the same image with another camera pose, depth bias and time offset."""
-
         bias = geometry.depth_bias_m
         return replace(
             self,
@@ -189,12 +179,10 @@ class View:
         person. Raises ValueError if a mask does not fit the image.
 
         Args:
-            geometry: camera and reduced lenses.
             depth_mm: (H, W) uint16 mm; None without a depth image.
             person_rle: mask of the person, COCO compressed RLE.
             candidates: (index, label, RLE) of each candidate.
-            detected: as the field.
-            background: as the field; None if unknown.
+            geometry, detected, background: as the fields.
         """
         depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step

@@ -48,7 +48,7 @@ def mask_overlap(image: Rendering, mask: ReducedMask, person: ReducedMask) -> fl
     """
     if not image.meets(mask.x0, mask.y0, *mask.mask.shape):
         return 0.0
-    visible, common = _compare(*_window(image), *_window(person), *_window(mask))
+    visible, common = _compare(image.face, (image.x0, image.y0), person.placed, mask.placed)
     return common / max(1, visible + mask.area - common)
 
 
@@ -56,32 +56,25 @@ def visible_pixels(image: Rendering, person: ReducedMask) -> int:
     """Count the pixels of a render that no person hides."""
     if not image.meets(person.x0, person.y0, *person.mask.shape):
         return image.area
-    return int(_compare(*_window(image), *_window(person), *_window(EMPTY))[0])
-
-
-def _window(image: Rendering | ReducedMask) -> tuple[np.ndarray, int, int]:
-    """Return the face numbers or the mask of a window (h, w), and its first pixel (x0, y0)."""
-    pixels = image.face if isinstance(image, Rendering) else image.mask
-    return pixels, image.x0, image.y0
+    return int(_compare(image.face, (image.x0, image.y0), person.placed, EMPTY.placed)[0])
 
 
 @numba.njit(cache=True, nogil=True)
-def _compare(face, x0, y0, person, px, py, mask, mx, my):
+def _compare(face, corner, person, mask):
     """Count the rendered pixels that are visible (:func:`mask_overlap`), and those in the mask.
 
-    The three images are windows, each followed by the column and row of its first pixel.
+    ``corner`` is the first pixel (x, y) of the rendering in the image.
     """
     visible, common = 0, 0
     for v in range(face.shape[0]):
-        own, other = v + y0 - my, v + y0 - py
         for u in range(face.shape[1]):
             if face[v, u] < 0:
                 continue
-            x = u + x0
-            if covers(mask, x - mx, own):
+            x, y = u + corner[0], v + corner[1]
+            if covers(mask, x, y):
                 visible += 1
                 common += 1
-            elif not covers(person, x - px, other):
+            elif not covers(person, x, y):
                 visible += 1
     return visible, common
 

@@ -176,14 +176,11 @@ class WholeTrack:
     ) -> list[FrameResult]:
         """Refine poses and covariances by all frames and the annotated poses together.
 
-        Args:
-            frames: decided frames (T).
-            given: annotated poses that the decided frames agree with.
+        ``given`` are annotated poses that the decided frames agree with.
 
-        Returns:
-            The frames with refined pose, covariance and status. Carried frames without an annotated
-            pose are flagged as ambiguous. So are frames next to unseen ones, if only one view shows
-            the object (:func:`.given_poses.flag_edges`).
+        Returns the frames with refined pose, covariance and status. Carried frames without an
+        annotated pose are flagged as ambiguous. So are frames next to unseen ones, if only one view
+        shows the object (:func:`.given_poses.flag_edges`).
         """
         fits = [frame.fit for frame in frames]
         lost = np.array([frame.lost for frame in frames])
@@ -226,11 +223,9 @@ class WholeTrack:
     ) -> np.ndarray:
         """Decide the status (T,) of each frame.
 
-        Args:
-            smoothed: the solution over all frames.
-            decided: (T,) log-likelihood ratios of the poses before smoothing, nats.
-            gone: (T,) frames in which the object has left by the decision; such a frame is GONE
-                instead of LOST if nothing else determines its pose.
+        ``decided`` (T,) are the log-likelihood ratios of the poses before smoothing, nats. In the
+        frames ``gone`` (T,) the object has left by the decision: such a frame is GONE instead of
+        LOST if nothing else determines its pose.
         """
         ratio = np.array([fit.log_ratio for fit in smoothed.fits])
         poses = np.array([fit.pose for fit in smoothed.fits])
@@ -265,10 +260,7 @@ class WholeTrack:
     ) -> _SmoothedTrack:
         """Solve for the track, evaluate the images at the solution, and solve again.
 
-        Args:
-            fits: decided fit of each frame.
-            lost: (T,) frames whose pose is filled in and whose images are no evidence.
-            given: annotated poses.
+        In ``lost`` frames (T,) the pose is filled in, and the images are no evidence.
         """
         count = len(fits)
         filled = fill_lost(self._observer, np.array([fit.pose for fit in fits]), lost)

@@ -54,6 +54,7 @@ def observer_of(
     given = {
         "mesh": capture.mesh,
         "times": capture.times,
+        "joints": np.full((len(images), 135, 3), np.nan),
         "labels": (capture.label,),
         "up": capture.master_from_room[:3, 2],
     }

@@ -13,7 +13,7 @@ from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.appearance import patches_of
 from intercap_core.object_track.colour_decision import ColourDecision
-from intercap_core.object_track.decoder import Decoded, decode, decode_given, mix_decisions
+from intercap_core.object_track.decoder import Decoded, MarkovModel, mix_decisions
 from intercap_core.object_track.hypotheses import Hypotheses, Prior
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.view import View
@@ -98,11 +98,12 @@ def decide(observer: Observer, capture: ObjectCapture, open_frames: set[int]) ->
         step = np.full((3, 3), -20.0 if together else 0.0)
         np.fill_diagonal(step, 0.0)
         steps.append(step[None, None])
-    before = decode(emissions, steps)
+    before = MarkovModel(emissions, steps).decode()
     assert all(
         before.probability[t][:2] == pytest.approx([0.5, 0.5], abs=0.01) for t in open_frames
     )
-    return ColourDecision(observer, hypotheses, 1.0).decide(emissions, steps, before)
+    model = MarkovModel(emissions, steps, 1.0)
+    return ColourDecision(observer, hypotheses).decide(model, before)
 
 
 def test_colours_decide_a_single_ambiguous_frame(toolbox, observe):
@@ -162,8 +163,9 @@ def test_results_given_each_state_average_to_the_whole():
     rng = np.random.default_rng(1)
     emissions = [rng.normal(size=n) for n in (2, 3, 2)]
     steps = [rng.normal(size=(2, 2, 3, 4)), rng.normal(size=(2, 2, 4, 3))]
-    whole = decode(emissions, steps)
-    parts = [decode_given(emissions, steps, 1, k) for k in range(3)]
+    model = MarkovModel(emissions, steps)
+    whole = model.decode()
+    parts = [model.decode_given(1, k) for k in range(3)]
     for k, part in enumerate(parts):
         assert part.path[1] == k and part.probability[1][k] == pytest.approx(1)
         log_share = np.log(whole.probability[1][k])
@@ -173,6 +175,6 @@ def test_results_given_each_state_average_to_the_whole():
     assert again.probability[1][:3] == pytest.approx(share / share.sum())
     by_hand = sum(s * part.probability[0] for s, part in zip(share, parts, strict=True))
     assert again.probability[0] == pytest.approx(by_hand / share.sum())
-    unseen = decode([emissions[0], np.full(3, -1e4), emissions[2]], steps)
+    unseen = MarkovModel([emissions[0], np.full(3, -1e4), emissions[2]], steps).decode()
     rest = share.sum() * again.probability[2] + (1 - share.sum()) * unseen.probability[2]
     assert rest == pytest.approx(whole.probability[2], abs=1e-9)

@@ -18,7 +18,7 @@ from intercap_core.object_track.decoder import (
     JUMP_COST,
     MODE_CHANGES_S,
     VANISH_COST,
-    decode,
+    MarkovModel,
     mode_log_ratios,
     step_log_ratios,
 )
@@ -49,7 +49,7 @@ def test_it_equals_the_sum_over_all_sequences(modes: int, counts: list[int]) -> 
     rng = np.random.default_rng(4)
     emissions = [rng.normal(size=n) for n in counts]
     steps = [rng.normal(size=(modes, modes, a + 1, b + 1)) for a, b in pairwise(counts)]
-    found = decode(emissions, steps, 0.3)
+    found = MarkovModel(emissions, steps, 0.3).decode()
     states = [[*product(range(n), range(modes)), ("hidden", 0), ("gone", 0)] for n in counts]
 
     def emission(t: int, k: int | str) -> float:
@@ -90,7 +90,7 @@ def test_only_a_lasting_preference_pays_for_a_jump(cup: ObjectMesh) -> None:
 
     def path(gain: float) -> list[int]:
         emissions = [np.array([5.0, 5.0 - gain])] * 6 + [np.array([5.0, 5.0 + gain])] * 4
-        return decode(emissions, steps).path.tolist()
+        return MarkovModel(emissions, steps).decode().path.tolist()
 
     assert path(1.0) == [0] * 10
     assert path(5.0) == [0] * 6 + [1] * 4
@@ -126,7 +126,8 @@ def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, fps: int) -> None
     still = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([0.1, 0, 0]))
     here, count = poses_of([0.0]), 3 * fps
     steps = [step_log_ratios(cup, here, here, 1 / fps, [still] * hands) for hands in range(3)]
-    none, *some = (decode([np.zeros(1)] * (count + 1), [s] * count).evidence for s in steps)
+    emissions = [np.zeros(1)] * (count + 1)
+    none, *some = (MarkovModel(emissions, [s] * count).decode().evidence for s in steps)
     assert some == pytest.approx([none] * 2, abs=0.1)
 
 
@@ -143,7 +144,7 @@ def test_an_object_moved_across_a_gap_is_the_same(cup: ObjectMesh, fps: int, gap
         for (a, b), gap in zip(pairwise(poses), seconds, strict=True)
     ]
     share = min(1.0, 1 / fps / ERROR_LASTING_S)
-    found = decode([np.array([30.0 * share])] * 12, steps, share * ABSENT_LOG_RATIO)
+    found = MarkovModel([np.array([30.0 * share])] * 12, steps, share * ABSENT_LOG_RATIO).decode()
     assert found.path.tolist() == [0] * 12
 
 
@@ -163,11 +164,11 @@ def test_a_turning_hand_carries_it_through_hidden_frames(cup: ObjectMesh) -> Non
     seen = [4.0 if t < 3 or t > 11 else 0.0 for t in range(len(turns))]
     emissions = [np.full(len(own), nats) for own, nats in zip(hypotheses, seen, strict=True)]
     emissions[12][1] += 1.0  # a little for the wrong one
-    resting = decode(emissions, steps).probability[-1]
+    resting = MarkovModel(emissions, steps).decode().probability[-1]
     for step in steps[2:12]:  # and it is lifted: it does not stand
         step[:, 0] = -np.inf
         step[0, 0, :, -1], step[0, 0, -1] = -7.0, -7.0
-    found = decode(emissions, steps)
+    found = MarkovModel(emissions, steps).decode()
     assert found.path.tolist() == [0] * len(turns)
     assert found.probability[-1][0] > 0.8 > resting[0]
 
@@ -196,7 +197,7 @@ def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:
         poses = [here] * 9 + [here[:0]] * unseen + [here] * 9
         emissions = [np.full(len(own), 4.0) for own in poses]
         steps = [step_log_ratios(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
-        found = decode(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S)
+        found = MarkovModel(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S).decode()
         assert (found.path[9:-9] == HIDDEN).all() and (found.path[:9] == 0).all()
         return float(found.gone[9 + unseen // 2])
 

@@ -200,7 +200,8 @@ def test_outline_costs_by_hand():
 
     def cost(mask, at, person=nobody):
         drawn = np.zeros((20, 20), np.int32)
-        return outline_cost(drawn, 50, 50, mask, *at, person, 50, 50, 200, 200, 1.0, 4.5)
+        corner = (50, 50)
+        return outline_cost(drawn, corner, (mask, *at), (person, *corner), 200, 200, 1.0, 4.5)
 
     square = np.ones((20, 20), bool)
     assert cost(square, (50, 50)) == (0.0, 152)

@@ -42,13 +42,13 @@ def at(x: float = 0.0, degrees: float = 0.0) -> np.ndarray:
     return rigid(turn.as_matrix(), np.array([x, 0, 2]))
 
 
-def test_distances_are_in_stated_deviations(suitcase):
+def test_poses_agree_within_stated_deviations(suitcase):
     given = annotate(0, at())
     centre = suitcase.centre_of_mass
     turned = at(degrees=10)
     turned[:3, 3] += centre - turned[:3, :3] @ centre  # about the centre
-    squared = given.squared_distances(suitcase, np.array([at(), at(0.02), turned]))
-    assert squared == pytest.approx([0, 4, 4], abs=1e-6)
+    assert given.distance(suitcase, at(0.02)) == pytest.approx((0, 0.02), abs=1e-6)
+    assert given.distance(suitcase, turned) == pytest.approx((np.radians(10), 0), abs=1e-6)
     # three standard deviations and 2 cm
     assert given.holds(suitcase, at(0.045)) and not given.holds(suitcase, at(0.055))
     assert GivenPose(0, at(), 0.02, FIVE_DEGREES).holds(suitcase, at(0.075))

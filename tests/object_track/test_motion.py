@@ -14,7 +14,6 @@ from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import MAX_HYPOTHESES, Hypotheses, Prior
 from intercap_core.object_track.motion import (
-    carry_in_hands,
     estimate_hand_motions,
     predict_prior,
     shift_twist,
@@ -44,8 +43,9 @@ def test_a_held_object_moves_with_wrist_and_forearm():
     after = np.stack([elbow + shift, turn @ wrist + shift])
     joints = joints_of(np.stack([elbow, after[0]]), np.stack([wrist, after[1]]))
     pose = rigid(np.eye(3), np.array([0.33, 0.02, 0.0]))
-    (found,) = carry_in_hands(joints, pose, pose[:3, 3], 0.05)
-    np.testing.assert_allclose(found, rigid(turn, shift) @ pose, atol=1e-12)
+    (hand, _) = estimate_hand_motions(joints)
+    assert hand is not None and hand.reaches(pose[:3, 3], 0.05)
+    np.testing.assert_allclose(hand.carry(pose), rigid(turn, shift) @ pose, atol=1e-12)
 
 
 def test_a_hand_turns_with_a_visible_palm():
@@ -71,12 +71,11 @@ def test_a_hand_turns_with_a_visible_palm():
 def test_an_object_out_of_reach_is_not_carried():
     forearm = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[0.25, 0, 0], [0.5, 0, 0]])
     joints = joints_of(*forearm)
-    far, near = np.eye(4), np.eye(4)
-    far[0, 3], near[0, 3] = 0.7, 0.35
-    assert len(carry_in_hands(joints, far, far[:3, 3], 0.05)) == 0
-    assert len(carry_in_hands(np.full((2, 135, 3), np.nan), far, far[:3, 3], 0.05)) == 0
+    (hand, _) = estimate_hand_motions(joints)
+    assert hand is not None
+    assert hand.reaches(np.array([[0.7, 0, 0], [0.35, 0, 0]]), 0.05).tolist() == [False, True]
     joints[1, WRIST] = np.nan  # unknown in the next frame
-    assert len(carry_in_hands(joints, near, near[:3, 3], 0.05)) == 0
+    assert estimate_hand_motions(joints) == [None, None]
 
 
 def test_the_prior_widens_with_time():

@@ -62,7 +62,8 @@ def test_the_handled_or_moved_object_is_the_tracked_one(bottle):
     places = Places(bottle, occupied, joints_at(HANDLED))
     assert places.prior(3, HANDLED) == 1.0 and places.prior(3, APART) == 0.1
     assert 0.1 < places.prior(3, np.array([-1.0, 0.0, 3.0])) < 1.0  # a new place: it moved
-    moved = Places(bottle, [OccupiedPlace(HANDLED, 1.0), OccupiedPlace(APART, 0.4)], None)
+    unknown = np.full((20, 135, 3), np.nan)
+    moved = Places(bottle, [OccupiedPlace(HANDLED, 1.0), OccupiedPlace(APART, 0.4)], unknown)
     assert moved.prior(3, APART) > moved.prior(3, HANDLED)
     places.claim(APART)
     assert places.prior(3, APART) > 0.5
