@@ -25,13 +25,8 @@ def choose_mask(
     one of greatest score is chosen: share of points inside, minus half of the share of the mask
     outside the subject's box, plus 0.15 for the label of a person. The weights are untuned.
 
-    Args:
-        points: (25, 2) pixels of the body.
-        seen: (25,) bool, usable points.
-        where: name of the image, for messages.
-
-    Raises:
-        UserError: the RLE of a candidate does not decode.
+    ``points`` (25, 2) are pixels of the body, ``seen`` (25,) the usable ones. Raises UserError,
+    with the name ``where`` of the image, if the RLE of a candidate does not decode.
     """
     bones = BONES[seen[BONES].all(1)]
     samples = np.concatenate([points[seen], points[bones].mean(1)])

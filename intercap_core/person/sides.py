@@ -32,12 +32,9 @@ LIMBS: tuple[np.ndarray, ...] = (ARMS, LEGS, HEAD, HANDS)
 BODY_POINTS = np.arange(BODY.start, BODY.stop)
 
 
-def swap_sides(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndarray:
-    """Keypoints (..., 135, n) with left and right of the indices ``limb`` exchanged; None = all."""
-    order = np.arange(len(PARTNER))
-    chosen = order if limb is None else limb
-    order[chosen] = PARTNER[chosen]
-    return keypoints[..., order, :]
+def swap_sides(keypoints: np.ndarray) -> np.ndarray:
+    """Keypoints (..., 135, n) with left and right exchanged."""
+    return keypoints[..., PARTNER, :]
 
 
 def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -54,10 +51,7 @@ def exchange_everywhere(
 ) -> tuple[np.ndarray, Triangulation]:
     """Return keypoints and triangulation with left and right exchanged, in all views of a set.
 
-    Args:
-        keypoints: (T, C, 135, n).
-        points: triangulation of T * 135 points.
-        which: (T, 4) bool, limbs to exchange in each set, in the order of :data:`LIMBS`.
+    ``which`` (T, 4) bool are the limbs to exchange in each set, in the order of :data:`LIMBS`.
     """
     keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), which), 1, 2)
     parts = (points.points, points.inlier, points.error, points.view_error)
@@ -79,14 +73,8 @@ def images_with_stated_sides(
 ) -> np.ndarray:
     """Mask (T, C) of the images in which the user states that left and right are exchanged.
 
-    Args:
-        stated: entries of the annotation; their ranges count recorded frames.
-        names: camera names.
-        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
-        sequence: name, for messages.
-
-    Raises:
-        UserError: an entry names an unknown camera.
+    ``stated`` are the entries of the annotation, whose ranges count recorded frames. Raises
+    UserError if one names an unknown camera.
     """
     result = np.zeros(image_of.shape, bool)
     for number, sides in enumerate(stated):
@@ -106,13 +94,8 @@ def hold_sides(
     """Apply the sides stated by the user to the corrected keypoints and points.
 
     If the correction exchanged a limb in most of a set's stated images, the limb is exchanged back
-    in all views of the set.
-
-    Args:
-        keypoints: (T, C, 135, 3) keypoints after automatic correction.
-        points: triangulation of T * 135 points.
-        given: (T, C, 135, 3) keypoints with the stated sides.
-        stated: (T, C) bool, images with stated sides.
+    in all views of the set. ``given`` are the keypoints before the correction, with the stated
+    sides in the images ``stated`` (T, C) bool.
     """
     wrong = np.zeros((len(keypoints), len(LIMBS)), bool)
     for number, limb in enumerate(LIMBS if stated.any() else ()):

@@ -95,8 +95,6 @@ def find_subject(
 
     Args:
         detections: people of each image, by moment.
-        times: (T,) seconds.
-        min_confidence: keypoints of lower confidence are ignored.
         lift: locates people of single views in sets in which no two views agree on a person.
         touches: contact with the object; None = not evaluated.
         named: detections named by the user.
@@ -114,13 +112,13 @@ def find_subject(
     tracks = link_groups(groups, times)
     people = np.full((detections.num_sets, len(rig)), NOBODY, np.int32)
     chosen, by, doubts = _chosen(tracks, times, ring_centre(rig), touches, named)
-    for t, group in zip(chosen.sets, chosen.groups, strict=True):
+    for t, group in chosen.groups.items():
         people[t] = group.members
     _add_single_views(people, chosen, groups, detections, rig, times, min_confidence)
     for detection in named:
         people[detection.t, detection.c] = detection.index
     counts = np.array([len(people_here) for people_here in groups], np.int32)
-    others = counts - np.isin(np.arange(len(counts)), chosen.sets)
+    others = counts - np.isin(np.arange(len(counts)), list(chosen.groups))
     return SubjectDetections(people, others, by, tuple(doubts))
 
 
@@ -148,7 +146,7 @@ def _chosen(
     if first:
         return people[0].track, "named", [*doubts, *people[0].doubts]
     if not people:
-        return PersonTrack(), "alone", doubts
+        return PersonTrack({}), "alone", doubts
     scores = [_score(person.track, middle) for person in people]
     order = np.argsort(scores)[::-1].tolist()
     # people of a lower score stay below RIVAL_SHARE even if they touch the object most
@@ -216,10 +214,8 @@ def _two_people(first: PersonTrack, second: PersonTrack) -> int | None:
 
 
 def _has(track: PersonTrack, named: NamedDetection) -> bool:
-    return any(
-        t == named.t and group.members[named.c] == named.index
-        for t, group in zip(track.sets, track.groups, strict=True)
-    )
+    group = track.groups.get(named.t)
+    return group is not None and bool(group.members[named.c] == named.index)
 
 
 def _score(track: PersonTrack, middle: np.ndarray) -> float:
@@ -230,7 +226,7 @@ def _score(track: PersonTrack, middle: np.ndarray) -> float:
     """
     return sum(
         group.support / (1 + (float(np.linalg.norm(group.centre - middle)) / 1.5) ** 2)
-        for group in track.groups
+        for group in track.groups.values()
     )
 
 
@@ -238,7 +234,7 @@ def _handling(track: PersonTrack, touches: Touches) -> float:
     """Share of contact among the images that show both the person and the object; 0 = no images."""
     contacts = [
         touches(t, c, int(group.members[c]))
-        for t, group in zip(track.sets, track.groups, strict=True)
+        for t, group in track.groups.items()
         for c in np.flatnonzero(group.members != NOBODY).tolist()
     ]
     known = [touch for touch in contacts if touch is not None]
@@ -249,8 +245,8 @@ def _rival(rival: Person, times: np.ndarray, by: str) -> str:
     """Message that another person may be the subject; ``by``: how the subject was chosen."""
     why = "touches the object more" if by == "handling" else "is seen more, or nearer the middle"
     return (
-        f"another person is seen in {len(rival.track.sets)} of {len(times)} frames, from frame "
-        f"{rival.track.sets[0]} on; the subject is taken to be the one who {why}, which is not "
+        f"another person is seen in {len(rival.track.groups)} of {len(times)} frames, from frame "
+        f"{min(rival.track.groups)} on; the subject is taken to be the one who {why}, which is not "
         "clear: name it by a point in an image (annotation 'subject')"
     )
 
@@ -269,15 +265,15 @@ def _add_single_views(
     In each view the detection closest to the subject's points of the nearest known set is added, if
     it is within twice the usual limit. Detections of people whom several views locate are excluded.
     """
-    if not chosen.sets:
+    if not chosen.groups:
         return
-    known = np.array(chosen.sets)
+    known = np.array(list(chosen.groups))
     limits = SAME_PERSON_PX_AT_1080P * pixel_scale(rig)
     for t in np.setdiff1d(np.arange(len(people)), known).tolist():
         place = int(np.argmin(np.abs(known - t)))
         if abs(times[t] - times[known[place]]) > MAX_LINK_GAP_S:
             continue
-        points = chosen.groups[place].points
+        points = chosen.groups[int(known[place])].points
         pixels = reproject(np.nan_to_num(points), rig)
         for c in range(len(rig)):
             best = 2.0 * limits[c]  # the subject moves in between

@@ -27,11 +27,8 @@ def named_people(
 
     It is the person whose bones are closest to the point, relative to the person's size in pixels.
 
-    Args:
-        points: entries of the annotation ``subject``; they count recorded frames.
-        detections: by moment.
-        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
-        min_confidence: keypoints of lower confidence are ignored.
+    ``points`` are entries of the annotation ``subject`` and count recorded frames; ``detections``
+    are by moment.
 
     Raises:
         UserError: unknown camera, frame without an image, point outside the image, or nobody there.

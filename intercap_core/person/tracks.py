@@ -9,7 +9,7 @@ more than the error of their median over a track.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, pairwise
 
@@ -42,10 +42,13 @@ _BONES = (
 class PersonTrack:
     """One person followed from set to set."""
 
-    sets: list[int] = field(default_factory=list)
-    """Frame sets, ascending."""
-    groups: list[PersonGroup] = field(default_factory=list)
-    """The person in each of ``sets``."""
+    groups: dict[int, PersonGroup]
+    """The person by frame set, ascending."""
+
+    @property
+    def last(self) -> int:
+        """The last frame set."""
+        return next(reversed(self.groups))
 
     @cached_property
     def build(self) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +56,7 @@ class PersonTrack:
 
         Lengths known in fewer than five sets are 0 with infinite variance.
         """
-        points = np.stack([group.points for group in self.groups])
+        points = np.stack([group.points for group in self.groups.values()])
         lengths = np.stack([_lengths(points, bone) for bone in _BONES], axis=1)  # (N, B)
         count = np.isfinite(lengths).sum(0)
         enough = count >= 5
@@ -78,21 +81,17 @@ def _lengths(points: np.ndarray, bone: np.ndarray) -> np.ndarray:
 
 
 def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> list[PersonTrack]:
-    """Follow people from set to set, over gaps of at most 0.4 s; the closest pairs are linked
-    first.
-
-    ``groups``: people of each of the T sets. ``times``: (T,) seconds.
-    """
+    """Follow people from set to set over gaps of at most 0.4 s; link the closest pairs first."""
     tracks: list[PersonTrack] = []
     for t, in_set in enumerate(groups):
         # within 0.4 s position alone identifies a person; tuned on the studio
-        free = [k for k in tracks if times[t] - times[k.sets[-1]] <= 0.4]
+        free = [k for k in tracks if times[t] - times[k.last] <= 0.4]
         pairs = sorted(
-            (group.distance(track.groups[-1]), g, k)
+            (group.distance(track.groups[track.last]), g, k)
             for g, group in enumerate(in_set)
             for k, track in enumerate(free)
         )
-        gaps = [float(times[t] - times[track.sets[-1]]) for track in free]
+        gaps = [float(times[t] - times[track.last]) for track in free]
         used_groups: set[int] = set()
         used_tracks: set[int] = set()
         for distance, g, k in pairs:
@@ -101,10 +100,9 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
                 continue
             used_groups.add(g)
             used_tracks.add(k)
-            free[k].sets.append(t)
-            free[k].groups.append(in_set[g])
+            free[k].groups[t] = in_set[g]
         tracks += [
-            PersonTrack([t], [group]) for g, group in enumerate(in_set) if g not in used_groups
+            PersonTrack({t: group}) for g, group in enumerate(in_set) if g not in used_groups
         ]
     return tracks
 
@@ -141,15 +139,14 @@ class Person:
         """All parts as one track."""
         groups: dict[int, PersonGroup] = {}
         for part in self.parts:
-            for t, group in zip(part.sets, part.groups, strict=True):
+            for t, group in part.groups.items():
                 groups[t] = groups[t].merged(group) if t in groups else group
-        return PersonTrack(sorted(groups), [groups[t] for t in sorted(groups)])
+        return PersonTrack({t: groups[t] for t in sorted(groups)})
 
     def shared(self, other: Person) -> list[tuple[int, PersonGroup, PersonGroup]]:
         """Sets that show both, with the group of each."""
-        theirs = dict(zip(other.track.sets, other.track.groups, strict=True))
-        own = zip(self.track.sets, self.track.groups, strict=True)
-        return [(t, group, theirs[t]) for t, group in own if t in theirs]
+        theirs = other.track.groups
+        return [(t, group, theirs[t]) for t, group in self.track.groups.items() if t in theirs]
 
     def meets(self, other: Person) -> bool:
         """Whether a frame set shows the two as different people."""
@@ -161,11 +158,8 @@ def join_tracks(
 ) -> list[Person]:
     """Join the tracks of a recording to people, by agglomerative clustering.
 
-    The pair of greatest likelihood is joined, until all remaining pairs are :data:`NEVER`.
-
-    Args:
-        times: (T,) seconds.
-        together: tracks of one person by the user's statement; the first person of the result.
+    The pair of greatest likelihood is joined, until all remaining pairs are :data:`NEVER`. The
+    tracks ``together`` are one person by the user's statement, the first of the result.
     """
     rest = [track for track in tracks if track not in together]
     people = [Person(_ordered(together))] if together else []
@@ -188,7 +182,7 @@ def join_tracks(
 
 
 def _ordered(parts: Sequence[PersonTrack]) -> tuple[PersonTrack, ...]:
-    return tuple(sorted(parts, key=lambda track: track.sets[0]))
+    return tuple(sorted(parts, key=lambda track: min(track.groups)))
 
 
 def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
@@ -219,7 +213,7 @@ def _seams(first: Person, second: Person) -> list[tuple[_Sighting, _Sighting]]:
     sightings = [
         (t, k, group)
         for k, person in enumerate((first, second))
-        for t, group in zip(person.track.sets, person.track.groups, strict=True)
+        for t, group in person.track.groups.items()
     ]
     sightings.sort(key=lambda sighting: sighting[:2])
     return [((s, a), (t, b)) for (s, i, a), (t, k, b) in pairwise(sightings) if i != k]

@@ -55,7 +55,7 @@ def test_exchanged_people_and_limbs_are_put_back(clean, exchanges):
     damaged = clean.copy()
     for sets, views, limb in exchanges:
         for c in views:
-            damaged[sets, c] = swap_sides(damaged[sets, c], limb)
+            damaged[sets, c, limb] = swap_sides(damaged[sets, c])[:, limb]
     fixed, error = corrected(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
     assert error.max() < 0.03
@@ -66,7 +66,7 @@ def test_views_from_behind_have_the_right_sides_without_a_face(clean, views):
     """The detector takes backs for fronts, and reports no face in these views."""
     damaged = clean.copy()
     for c in views:
-        damaged[:, c] = swap_sides(damaged[:, c], ALL)
+        damaged[:, c, ALL] = swap_sides(damaged[:, c])[:, ALL]
         damaged[:, c, 67:, 2] = damaged[:, c, [0, 15, 16], 2] = 0
     _, error = corrected(damaged)
     limbs = np.r_[ARMS, LEGS, HANDS]  # the ears alone do not tell their sides

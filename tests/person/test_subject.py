@@ -356,12 +356,12 @@ def test_uncertain_return_is_reported(tmp_path):
 
 def test_tracks_without_a_common_set_are_one_person():
     whole = track_of(1.0, 60, 1)
-    groups = np.array(whole.groups, object)
-    odd, even = (PersonTrack(list(range(k, 60, 2)), groups[k::2].tolist()) for k in (1, 0))
+    groups = whole.groups
+    odd, even = (PersonTrack({t: groups[t] for t in range(k, 60, 2)}) for k in (1, 0))
     times = np.arange(60) / FPS
     (person,) = join_tracks([odd, even], times)
-    assert person.track.sets == whole.sets and person.track.groups == whole.groups
-    even.sets[0] = 1
+    assert list(person.track.groups.items()) == list(groups.items())
+    even = PersonTrack({max(t, 1): group for t, group in even.groups.items()})
     assert len(join_tracks([odd, even], times)) == 2
 
 
@@ -370,7 +370,7 @@ def track_of(size: float, sets: int, seed: int) -> PersonTrack:
     points = points + np.random.default_rng(seed).normal(0, 0.02, points.shape)
     none = np.zeros(VIEWS)
     groups = [PersonGroup(none.astype(np.int32), body, 1.0, none) for body in points]
-    return PersonTrack(list(range(sets)), groups)
+    return PersonTrack(dict(enumerate(groups)))
 
 
 def test_build_is_more_certain_with_more_frames():

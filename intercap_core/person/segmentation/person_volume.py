@@ -177,12 +177,10 @@ class MovingPerson:
         scene: Artefact,
         frame_from_master: np.ndarray | None = None,
     ) -> None:
-        """
-        Args:
-            joints: (T, K, 3) master frame, metres; NaN = unknown.
-            sigma: (T, K) standard deviations, metres.
-            scene: scene artefact, for times and time offsets.
-            frame_from_master: (4, 4) to the frame of the result; None = the master's.
+        """``sigma`` (T, K) are standard deviations of ``joints`` (T, K, 3), master frame, metres.
+
+        ``scene`` gives times and time offsets, ``frame_from_master`` (4, 4) leads to the frame of
+        the result; None = the master's.
         """
         times = scene["times"]
         if frame_from_master is not None:
