@@ -36,14 +36,9 @@ def linear(levels: np.ndarray) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def _log_light() -> np.ndarray:
-    result = np.full(256, np.nan)
-    result[LEVELS_USED] = np.log(linear(np.arange(256)[LEVELS_USED]))
-    return result
-
-
-LIGHT = _log_light()
+LIGHT = np.full(256, np.nan)
 """(256,) logarithms of light of the grey levels, NaN outside of ``LEVELS_USED``."""
+LIGHT[LEVELS_USED] = np.log(linear(np.arange(256)[LEVELS_USED]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +75,10 @@ class Appearance:
     def __init__(
         self, sightings: Sequence[SurfaceColours], views: int, paint: Paint | None, size: float
     ) -> None:
-        """Learn the colours.
+        """Learn the colours from ``sightings`` of one frame each, at its pose.
 
-        Args:
-            sightings: colours of one frame each, at its pose.
-            views: number of views.
-            paint: colours of the mesh; ignored if they do not explain the learnt ones.
-            size: size of a patch, metres.
+        ``paint`` are colours of the mesh, ignored if they do not explain the learnt ones. ``size``
+        is that of a patch, metres.
         """
         self.sightings = tuple(sightings)
         self._patches = np.unique(np.concatenate([s.patch for s in sightings]))

@@ -30,10 +30,8 @@ from intercap_core.object_track.turns import SAME_POSE_M, SAME_POSE_RAD, UNSURE_
 class Bridge:
     """One possible path of the object through N lost frames."""
 
-    frames: np.ndarray
-    """(N,) the lost frames."""
     poses: np.ndarray
-    """(N, 4, 4) poses in them."""
+    """(N, 4, 4) poses in the lost frames."""
     end: np.ndarray
     """(4, 4) pose of the known frame after the gap, as the symmetric equivalent that is reached."""
     log_ratio: float
@@ -46,14 +44,10 @@ class Bridge:
 class Gap:
     """Lost frames between two known frames of a track, or at an end of it."""
 
-    mesh: ObjectMesh
-    """The object."""
+    observer: Observer
+    """The recording."""
     poses: np.ndarray
     """(T, 4, 4) poses of the track."""
-    times: np.ndarray
-    """(T,) seconds."""
-    joints: np.ndarray
-    """(T, K, 3) of the person, metres, NaN where unknown."""
     frames: np.ndarray
     """(N,) the lost frames."""
     before: int
@@ -67,19 +61,19 @@ class Gap:
     @property
     def seconds(self) -> float:
         """Time from the first to the last of the lost and known frames."""
-        return float(np.ptp(self.times[[*self.frames[[0, -1]], self.before, self.after]]))
+        return float(np.ptp(self.observer.times[[*self.frames[[0, -1]], self.before, self.after]]))
 
     def bridges(self) -> list[Bridge]:
         """Return the possible paths: straight, and with each hand that may have held the object."""
-        a, b = self.step
-        hands = estimate_hand_motions(self.joints[[a, b]])
-        seconds = abs(float(self.times[b] - self.times[a]))
-        modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], seconds, hands)
+        (a, b), observer = self.step, self.observer
+        hands = estimate_hand_motions(observer.joints[[a, b]])
+        seconds = abs(float(observer.times[b] - observer.times[a]))
+        modes = mode_log_ratios(observer.mesh, self.poses[[a]], self.poses[[b]], seconds, hands)
         rest, free, *in_hand = modes[:, 0, 0]
         end = self._end(self.poses[a])
         direct = self._straight(end)
         nothing = np.zeros((len(self.frames), 6, 6))
-        result = [Bridge(self.frames, direct, end, float(max(rest, free)), nothing)]
+        result = [Bridge(direct, end, float(max(rest, free)), nothing)]
         for number, (hand, own) in enumerate(zip(hands, in_hand, strict=True)):
             if hand is None or not np.isfinite(own):
                 continue
@@ -90,7 +84,7 @@ class Gap:
                 if found is not None:
                     poses[i], information[i] = found
             if information.any():
-                result.append(Bridge(self.frames, poses, end, float(own), information))
+                result.append(Bridge(poses, end, float(own), information))
         return result
 
     def _end(self, expected: np.ndarray) -> np.ndarray:
@@ -98,7 +92,7 @@ class Gap:
         pose = self.poses[self.after]
         if self.before == self.after:
             return pose
-        return self.mesh.symmetry.nearest_equivalent_pose(pose, expected)
+        return self.observer.mesh.symmetry.nearest_equivalent_pose(pose, expected)
 
     def _straight(self, end: np.ndarray) -> np.ndarray:
         """Return poses (N, 4, 4) by the shortest turn and the straight line to ``end`` (4, 4)."""
@@ -117,19 +111,71 @@ class Gap:
         grow with the time to the nearer known frame, and with the distance from the wrist. None if
         the motion of the hand is unknown.
         """
+        joints, times = self.observer.joints, self.observer.times
         forwards, backwards = (
-            estimate_hand_motions(self.joints[[u, t]])[hand] for u in (self.before, self.after)
+            estimate_hand_motions(joints[[u, t]])[hand] for u in (self.before, self.after)
         )
         if forwards is None or backwards is None:
             return None
         carried = [forwards.carry(self.poses[self.before]), backwards.carry(end)]
-        share = (self.times[t] - self.times[self.before]) / self.seconds
+        share = (times[t] - times[self.before]) / self.seconds
         pose = apply_step(carried[0], share * step_between(*carried))
-        nearer = np.abs(self.times[[self.before, self.after]] - self.times[t]).min()
+        nearer = np.abs(times[[self.before, self.after]] - times[t]).min()
         turn = np.hypot(SAME_POSE_RAD, HELD_RAD_S * nearer)
-        arm = np.linalg.norm(self.mesh.centre_at(pose) - forwards.end)
+        arm = np.linalg.norm(self.observer.mesh.centre_at(pose) - forwards.end)
         shift = np.linalg.norm([SAME_POSE_M, HELD_M_S * nearer, arm * turn])
         return pose, np.diag(np.repeat([turn, shift], 3) ** -2.0)
+
+    def choose(self) -> tuple[Bridge, list[FittedPose], bool]:
+        """Choose the path with the highest likelihood of motion and images.
+
+        Returns:
+            The path.
+            The fits of its frames; none if there is only one path.
+            Whether the path is sure: the odds against any different path are above seven to one (2
+                nats), and the images do not contradict it.
+        """
+        paths = self.bridges()
+        if len(paths) == 1:
+            return paths[0], [], False
+        fits = [self._fit(path) for path in paths]
+
+        def log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
+            """Images' log-likelihood ratio of a fit, less its deviation from the path."""
+            step = step_between(pose, fit.pose)
+            return fit.log_ratio - 0.5 * float(step @ information @ step)
+
+        by_images = np.array(
+            [
+                self.observer.share * sum(map(log_ratio, path.poses, path.information, own))
+                for path, own in zip(paths, fits, strict=True)
+            ]
+        )
+        total = by_images + [path.log_ratio for path in paths]
+        best = int(total.argmax())
+        different = [_is_different(self.observer.mesh, paths[best], path) for path in paths]
+        lead = total[best] - max(total[different], default=-np.inf)
+        return (
+            paths[best],
+            fits[best],
+            bool(lead > 2.0 and by_images[best] > CONTRADICTED_LOG_RATIO),
+        )
+
+    def _fit(self, path: Bridge) -> list[FittedPose]:
+        """Compare a path with the images; poses in a hand are fitted, with the hand as prior."""
+        count, observer = len(self.frames), self.observer
+        motion = rigid_velocity(path.poses, np.ones(count, bool), observer.times[self.frames])
+        result = []
+        for t, pose, information, twist in zip(
+            self.frames.tolist(), path.poses, path.information, motion, strict=True
+        ):
+            if information.any():
+                turn, shift = information.diagonal()[[0, 3]] ** -0.5
+                prior = MotionPrior(pose, sigma_m=float(shift), sigma_rad=float(turn))
+                result.append(observer.fit(t, pose, prior, FIT_ROUNDS, twist=twist))
+            else:
+                result.append(observer.assess(t, pose, twist=twist))
+        return result
 
 
 @dataclass(frozen=True)
@@ -165,7 +211,7 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
     Known ``poses`` (T, 4, 4) are replaced by equivalent ones that follow each other. ``lost`` (T,)
     bool.
     """
-    count, symmetry, known, times = len(poses), observer.mesh.symmetry, ~lost, observer.times
+    count, symmetry, known = len(poses), observer.mesh.symmetry, ~lost
     track = unwrap_symmetry(symmetry, poses, known)
     hand, images = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     pull, sure = np.zeros((count, 6)), np.zeros(count, bool)
@@ -181,50 +227,19 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
             step, a = (ends[1], b), b
         elif b == count:
             step, b = (ends[-2], a), a
-        gap = Gap(observer.mesh, track, times, observer.joints, frames, a, b, step)
-        path, fits, is_sure = _choose_path(observer, gap.bridges())
+        gap = Gap(observer, track, frames, a, b, step)
+        path, fits, is_sure = gap.choose()
         track[frames] = [fit.pose for fit in fits] if fits else path.poses
         track[b] = path.end
         track[b:] = unwrap_symmetry(symmetry, track[b:], known[b:])
         in_hand = np.any(path.information, axis=(1, 2))
-        for i, t in enumerate(path.frames):
+        for i, t in enumerate(frames):
             if in_hand[i]:
                 hand[t] = path.information[i]
                 images[t] = np.linalg.inv(fits[i].covariance) - path.information[i]
                 pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
-        sure[path.frames] = in_hand & (is_sure and gap.seconds < UNSEEN_S)
+        sure[frames] = in_hand & (is_sure and gap.seconds < UNSEEN_S)
     return FilledTrack(track, hand, images, pull, sure)
-
-
-def _choose_path(observer: Observer, paths: list[Bridge]) -> tuple[Bridge, list[FittedPose], bool]:
-    """Choose the path with the highest likelihood of motion and images.
-
-    Returns:
-        The path.
-        The fits of its frames; none if there is only one path.
-        Whether the path is sure: the odds against any different path are above seven to one (2
-            nats), and the images do not contradict it.
-    """
-    if len(paths) == 1:
-        return paths[0], [], False
-    fits = [_fit_path(observer, path) for path in paths]
-
-    def log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
-        """Images' log-likelihood ratio of a fit, less its deviation from the path."""
-        step = step_between(pose, fit.pose)
-        return fit.log_ratio - 0.5 * float(step @ information @ step)
-
-    by_images = np.array(
-        [
-            observer.share * sum(map(log_ratio, path.poses, path.information, own))
-            for path, own in zip(paths, fits, strict=True)
-        ]
-    )
-    total = by_images + [path.log_ratio for path in paths]
-    best = int(total.argmax())
-    different = [_is_different(observer.mesh, paths[best], path) for path in paths]
-    lead = total[best] - max(total[different], default=-np.inf)
-    return paths[best], fits[best], bool(lead > 2.0 and by_images[best] > CONTRADICTED_LOG_RATIO)
 
 
 def _is_different(mesh: ObjectMesh, path: Bridge, other: Bridge) -> bool:
@@ -233,21 +248,3 @@ def _is_different(mesh: ObjectMesh, path: Bridge, other: Bridge) -> bool:
         pose_distances(mesh, p[None], q[None]) for p, q in zip(path.poses, other.poses, strict=True)
     ]
     return any(turn[0, 0] > UNSURE_RAD or shift[0, 0] > UNSURE_M for turn, shift in pairs)
-
-
-def _fit_path(observer: Observer, path: Bridge) -> list[FittedPose]:
-    """Compare a path with the images; poses in a hand are fitted, with the hand as prior."""
-    motion = rigid_velocity(
-        path.poses, np.ones(len(path.frames), bool), observer.times[path.frames]
-    )
-    result = []
-    for t, pose, information, twist in zip(
-        path.frames.tolist(), path.poses, path.information, motion, strict=True
-    ):
-        if information.any():
-            turn, shift = information.diagonal()[[0, 3]] ** -0.5
-            prior = MotionPrior(pose, sigma_m=float(shift), sigma_rad=float(turn))
-            result.append(observer.fit(t, pose, prior, FIT_ROUNDS, twist=twist))
-        else:
-            result.append(observer.assess(t, pose, twist=twist))
-    return result

@@ -45,12 +45,7 @@ class ColourDecision:
 
         ``decoded`` is the result of the ``model``, which has no colours.
         """
-        sure = np.array(
-            [
-                0.0 if k == HIDDEN else p[k]
-                for p, k in zip(decoded.probability, decoded.path, strict=True)
-            ]
-        )
+        sure = decoded.certainty
         first = int(sure.argmax())
         if self._observer.pictures is None or not sure[first]:
             return decoded
@@ -95,11 +90,8 @@ class ColourDecision:
 
     def _learn(self, decoded: Decoded) -> Appearance | None:
         """Learn the colours of certain frames; None if there are too few."""
-        certain = [
-            t
-            for t in range(0, len(decoded.path), self._observer.frames_in(KEY_FRAME_S))
-            if decoded.path[t] != HIDDEN and decoded.probability[t][decoded.path[t]] > 0.8
-        ]
+        sure, every = decoded.certainty, self._observer.frames_in(KEY_FRAME_S)
+        certain = [t for t in range(0, len(sure), every) if sure[t] > 0.8]
         some = np.linspace(0, len(certain) - 1, min(len(certain), 12)).round()
         seen = [self._colours(certain[i], decoded.path[certain[i]]) for i in some.astype(int)]
         kept = [colours for colours in seen if colours is not None]

@@ -142,6 +142,12 @@ class Decoded:
     evidence: float
     """Log-likelihood of all frames, relative to the object being in none."""
 
+    @property
+    def certainty(self) -> np.ndarray:
+        """(T,) probability of the most likely hypothesis, 0 if none is true."""
+        chosen = zip(self.probability, self.path, strict=True)
+        return np.array([0.0 if k == HIDDEN else own[k] for own, k in chosen])
+
 
 @dataclass(frozen=True)
 class MarkovModel:

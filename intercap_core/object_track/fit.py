@@ -105,9 +105,8 @@ def fit_pose(
             moved by the twist times its time offset.
     """
     pool = context.renderer.pool
-    depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
-    depth_scale = max(depth_scale * start_scale, DEPTH_SCALES_M[1])
-    contour_scale = max(contour_scale * start_scale, CONTOUR_SCALES_PX[1])
+    scales, last_scales = np.array([DEPTH_SCALES_M, CONTOUR_SCALES_PX]).T
+    scales = np.maximum(scales * start_scale, last_scales)
     drawn_pose = pose
     fits = view_fits(context, views, drawn_pose, twist)
     information = np.eye(6)
@@ -120,11 +119,10 @@ def fit_pose(
         done = False
         last = np.zeros(6)
         for _ in range(steps):
-            information, step = _step(context, fits, prior, drawn_pose, depth_scale, contour_scale)
+            information, step = _step(context, fits, prior, drawn_pose, scales)
             pose = apply_step(drawn_pose, step)
-            settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
-            depth_scale = max(depth_scale * 0.5, DEPTH_SCALES_M[1])
-            contour_scale = max(contour_scale * 0.5, CONTOUR_SCALES_PX[1])
+            settled = bool((scales <= last_scales).all())
+            scales = np.maximum(scales * 0.5, last_scales)
             # 0.5 mm: 0.2 px of 1080p at 2.5 m
             done = settled and _is_below(step - last, 5e-4, np.radians(0.1))
             if done:
@@ -147,13 +145,13 @@ def _step(
     fits: list[ViewFit],
     prior: MotionPrior | None,
     pose: np.ndarray,
-    depth_scale: float,
-    contour_scale: float,
+    scales: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6, 6) of all views at their current pose, and the step (6,)."""
+    depth_m, contour_px = scales.tolist()
 
     def terms(fit: ViewFit) -> NormalEquations:
-        return fit.normal_equations(depth_scale, contour_scale, context.background_term)
+        return fit.normal_equations(depth_m, contour_px, context.background_term)
 
     hessian, gradient = _prior_terms(prior, pose)
     for h, g in context.renderer.pool.map(terms, fits):

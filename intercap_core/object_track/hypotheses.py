@@ -203,14 +203,8 @@ class Hypotheses:
             unwrap_symmetry(self._observer.mesh.symmetry, poses, known), known, self._times
         )
         changed = set()
-        late = max(
-            (
-                abs(view.geometry.time_offset_s)
-                for t in frames[:1]
-                for view in self._observer.views(t)
-            ),
-            default=0.0,
-        )
+        views = self._observer.views(frames[0]) if frames else []
+        late = max((abs(view.geometry.time_offset_s) for view in views), default=0.0)
         for t in frames:
             for k, fit in enumerate(self.fits[t]):
                 twist = shift_twist(motion[t], poses[t, :3, 3], fit.pose[:3, 3])

@@ -36,6 +36,11 @@ DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples;
 # Independent samples of a view's depth, outline or colours at most, since its pixels err together.
 VIEW_SAMPLES = 4.0  # tuned
 LOG_MISSED = float(np.log(0.1))  # how often detectors miss an object that is fully visible; tuned
+SURFACE_SIGMA_M = 0.008  # of depth from the mesh: sensor, calibration, mesh
+ROOM_DEPTH_M = 0.025  # three standard deviations of depth from the empty room
+CLUTTER_M = 0.3  # other surfaces are measured uniformly within this range of the object
+LOG_PAST = float(np.log(0.03))  # share of pixels that see past the object (flying pixels, edges)
+LOG_HIDDEN = float(np.log(0.15))  # share of pixels that something other than a person hides
 LABEL_LOG_RATIO = 1.0  # nats of a candidate with the object's label; minus this with another; tuned
 
 
@@ -78,12 +83,6 @@ def _depth(
     colour_from_depth = geometry.camera.colour_from_depth
     assert colour_from_depth is not None
     mask = candidate.mask if candidate is not None else EMPTY
-    likely_sigma_m = 0.008  # of depth from the mesh: sensor, calibration, mesh
-    background_m = 0.025  # three standard deviations of depth from the empty room
-    clutter_m = 0.3  # other surfaces are measured uniformly within this range of the object
-    # share of pixels that see past the object (flying pixels, edges), and of pixels that something
-    # other than a person hides
-    log_past, log_hidden = float(np.log(0.03)), float(np.log(0.15))
     room = np.zeros((0, 0), np.float32)
     if view.background is not None:
         room = view.background[drawn.window]
@@ -92,8 +91,7 @@ def _depth(
         geometry.depth_lens.rays, mesh.face_normals,
         geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
-        view.person.placed, mask.placed,
-        likely_sigma_m, background_m, clutter_m, log_past, log_hidden, mesh.diameter,
+        view.person.placed, mask.placed, mesh.diameter,
     )  # fmt: skip
     return VIEW_SAMPLES * total / (count + DEPTH_HALF_SAMPLES_PX)
 
@@ -126,17 +124,16 @@ def _mask(
 @numba.njit(cache=True, nogil=True)
 def depth_log_ratio(
     rendered, face, corner, measured, background, rays, face_normals, rotation,
-    colour_from_depth, colour, person, mask,
-    sigma, background_m, clutter_m, log_past, log_hidden, diameter,
+    colour_from_depth, colour, person, mask, diameter,
 ):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
 
-    Without the object, depth is uniform over ``clutter_m``. With it, a pixel shows the surface, by
-    a Gaussian of ``sigma`` along its normal. If that is less likely, it shows background behind the
-    surface (``log_past``) or an occluder (``log_hidden``). Pixels outside of the mask that a person
-    explains are no evidence. Neither are those that show the empty room: a flat object fits any
-    floor, and furniture may hide the object. Only if the room's surface is less than a diameter in
-    front of the object, it contradicts the pose, because the object does not lie in the floor.
+    Without the object, depth is uniform over ``CLUTTER_M``. With it, a pixel shows the surface, by
+    a Gaussian of ``SURFACE_SIGMA_M`` along its normal. If that is less likely, it shows background
+    behind it (``LOG_PAST``) or an occluder (``LOG_HIDDEN``). Pixels outside of the mask that a
+    person explains are no evidence. Neither are those that show the empty room: a flat object fits
+    any floor, and furniture may hide the object. Only if the room's surface is less than a diameter
+    in front of the object, it contradicts the pose, because the object does not lie in the floor.
 
     Args:
         rendered, face: (h, w) of the rendering, whose first pixel is ``corner`` of the depth image.
@@ -146,17 +143,13 @@ def depth_log_ratio(
         face_normals, rotation: (F, 3) unit normals and (3, 3) depth camera_from_object.
         colour_from_depth, colour: (4, 4), and (13,) parameters of the colour lens.
         person, mask: masks of the colour image (:attr:`.reduced_mask.ReducedMask.placed`).
-        sigma: standard deviation of depth from the surface, metres.
-        background_m: largest difference from the empty room at which depth shows the room, metres.
-        clutter_m: range in which other surfaces are measured uniformly, metres.
-        log_past, log_hidden: least values of a pixel, of background and of occlusion.
         diameter: of the object, metres.
 
     Returns:
         The sum, and the number of pixels with a measurement.
     """
     total, count = 0.0, 0
-    agrees = np.log(clutter_m / (sigma * np.sqrt(2 * np.pi)))
+    agrees = np.log(CLUTTER_M / (SURFACE_SIGMA_M * np.sqrt(2 * np.pi)))
     for v in range(rendered.shape[0]):
         for u in range(rendered.shape[1]):
             f = face[v, u]
@@ -170,21 +163,21 @@ def depth_log_ratio(
             i, j = corner[0] + u, corner[1] + v
             rx, ry = rays[j, i, 0], rays[j, i, 1]
             nx, ny, nz = rotated_normal(face_normals, f, rotation)
-            across = gap * (nx * rx + ny * ry + nz) / sigma
+            across = gap * (nx * rx + ny * ry + nz) / SURFACE_SIGMA_M
             shown = agrees - 0.5 * across * across
             if gap > 0 and shown <= 0:
-                total += max(shown, log_past)
+                total += max(shown, LOG_PAST)
                 continue
             cx, cy, cz = transform_point(colour_from_depth, rx * z, ry * z, z)
             column, row = project_point(cx, cy, cz, colour)
             x, y = int(np.rint(column)), int(np.rint(row))
             if covers(mask, x, y):
-                total += max(shown, log_hidden)
+                total += max(shown, LOG_HIDDEN)
             elif not covers(person, x, y):
                 known = background[v, u] if background.size else np.float32(0.0)
-                is_room = known > 0 and abs(known - z) <= background_m
+                is_room = known > 0 and abs(known - z) <= ROOM_DEPTH_M
                 if not is_room or (shown < 0 and gap > -diameter):
-                    total += max(shown, log_hidden)
+                    total += max(shown, LOG_HIDDEN)
     return total, count
 
 

@@ -206,7 +206,7 @@ class Tracker:
         places.clear_rivals()
         for t, given in self._prior.given.items():
             self._exclude_others(t, given, centres[t])
-        for t in np.flatnonzero(_sure_frames(decoded)).tolist():
+        for t in np.flatnonzero(decoded.certainty > DOUBTFUL_PROBABILITY).tolist():
             k, number = decoded.path[t], group_by_candidates(fits[t])
             for other, fit in enumerate(fits[t]):
                 if number[other] != number[k] and fit.log_ratio > SEEN_LOG_RATIO:
@@ -272,16 +272,6 @@ class Tracker:
         weights = self._prior.weigh(u, fits[u])
         assessed = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
         return FittedPose(assessed.pose, np.eye(6), assessed.views)
-
-
-def _sure_frames(decoded: Decoded) -> np.ndarray:
-    """Return frames (T,) bool whose hypothesis exceeds ``DOUBTFUL_PROBABILITY``."""
-    return np.array(
-        [
-            k != HIDDEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY
-            for t, k in enumerate(decoded.path)
-        ]
-    )
 
 
 def describe_contradiction(mesh: ObjectMesh, given: GivenPose, frame: FrameResult) -> str:

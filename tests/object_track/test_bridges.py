@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.bridges import Bridge, FilledTrack, Gap, fill_lost
@@ -35,10 +36,18 @@ def arc() -> np.ndarray:
     return rigid(turns.as_matrix(), turns.apply([0.3, 0, 0]))
 
 
+def gap_of(mesh: ObjectMesh, poses: np.ndarray, joints: np.ndarray, before: int) -> Gap:
+    """Gap after frame ``before`` that ends as long before the last frame."""
+    count = len(poses)
+    ends = before, count - 1 - before
+    observer = Observer(
+        mesh, lambda t: [], [[]] * count, ObjectTrackSettings(), np.arange(count) / 30, joints
+    )
+    return Gap(observer, poses, np.arange(before + 1, ends[1]), *ends, ends)
+
+
 def bridges_of(mesh: ObjectMesh, poses: np.ndarray, joints: np.ndarray) -> list[Bridge]:
-    ends = 1, FRAMES - 2
-    lost = np.arange(2, FRAMES - 2)
-    return Gap(mesh, poses, np.arange(FRAMES) / 30, joints, lost, *ends, ends).bridges()
+    return gap_of(mesh, poses, joints, 1).bridges()
 
 
 def test_a_held_object_moves_with_the_hand(suitcase, arc):
@@ -77,7 +86,7 @@ def test_a_straight_path_is_the_shortest_turn_and_line(suitcase):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[3, :3, 3] = [0.3, 0, 0]
     poses[3, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    (path,) = Gap(suitcase, poses, np.arange(4.0), None, np.arange(1, 3), 0, 3, (0, 3)).bridges()
+    (path,) = gap_of(suitcase, poses, np.full((4, 135, 3), np.nan), 0).bridges()
     np.testing.assert_allclose(path.poses[:, 0, 3], [0.1, 0.2])
     angle = Rotation.from_matrix(path.poses[:, :3, :3]).magnitude()
     np.testing.assert_allclose(np.degrees(angle), [30, 60])
