@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 
 import numpy as np
@@ -125,21 +125,59 @@ def _correct_cameras(
     return state
 
 
-@dataclass(frozen=True)
+@dataclass
 class _WindowFit:
-    """Result of the rounds in a window of T frames; see :class:`JointFit`."""
+    """Fit of a window of T frames after the rounds so far; see :class:`JointFit`."""
 
     state: State
     contact: ContactEstimate
-    residuals: BodyResiduals
-    energy_before: dict[str, np.ndarray]  # (T,) by term
-    energy_after: dict[str, np.ndarray]  # (T,) by term
-    steps: int
-    refused: int
-    convergence: Convergence
-    faults: FrameFaults
-    last_step_m: float
-    last_decrease: float
+    stalled: np.ndarray  # (T,) frames that no round moved, since each step raised the energy there
+    energy_before: dict[str, np.ndarray] = field(default_factory=dict)  # (T,) by term
+    energy_after: dict[str, np.ndarray] = field(default_factory=dict)  # (T,) by term
+    steps: int = 0
+    refused: int = 0
+    last_step_m: float = 0.0
+    last_decrease: float = 0.0
+    unchanged: bool = False  # The last round hardly changed state and contact
+    residuals: BodyResiduals = field(init=False)  # Of the final state
+    faults: FrameFaults = field(init=False)  # Of the final state
+
+    @property
+    def convergence(self) -> Convergence:
+        """Outcome so far."""
+        if self.unchanged:
+            return Convergence.CONVERGED
+        if self.steps == 0 and self.refused > 0:
+            return Convergence.STALLED
+        return Convergence.ITERATION_LIMIT
+
+    def minimise(
+        self,
+        assembly: Assembly,
+        geometry: Geometry,
+        contact_at: Callable[[State], ContactEstimate],
+        max_steps: int,
+    ) -> None:
+        """Update correspondences, minimise, and estimate contact again."""
+        before, contact = self.state, self.contact
+        if assembly.contact is not None:
+            assembly.contact.take_contact(contact.probability, contact.labels)
+        assembly.problem.refresh(before)
+        minimum = minimise(assembly.problem, before, max_steps=max_steps)
+        self.state = minimum.state
+        self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
+        self.energy_before = self.energy_before or minimum.energies_before
+        self.energy_after = minimum.energies
+        self.last_step_m = _displacement(geometry, minimum.previous, minimum.state)
+        self.last_decrease = minimum.decrease
+        self.stalled &= minimum.stalled
+        log.info("%d steps, energy %.4g", self.steps, sum(map(np.sum, minimum.energies.values())))
+        settled = minimum.converged or minimum.steps > 0  # not each step was refused
+        self.contact = contact_at(self.state)
+        changed_m = _displacement(geometry, before, self.state)
+        # the limit of the contact probability is tuned on the studio
+        contact_change = self.contact.change(contact)
+        self.unchanged = settled and changed_m < UNCHANGED_M and contact_change < 0.1
 
 
 def _fit_window(
@@ -149,36 +187,24 @@ def _fit_window(
     contact_at: Callable[[State], ContactEstimate],
 ) -> _WindowFit:
     """Minimise the energy of a window from ``start``; ``contact_at`` estimates contact."""
-    rounds = _Rounds(inputs.geometry, assembly, start, contact_at)
+    fit = _WindowFit(start, contact_at(start), np.ones(len(start), bool))
     for max_steps in ROUND_STEPS:
-        rounds.minimise(max_steps)
-        if rounds.convergence == Convergence.CONVERGED:
+        fit.minimise(assembly, inputs.geometry, contact_at, max_steps)
+        if fit.convergence == Convergence.CONVERGED:
             break
-    state, convergence = rounds.state, rounds.convergence
-    stalled = rounds.stalled | (convergence == Convergence.STALLED)
     log.log(
-        logging.WARNING if convergence == Convergence.STALLED else logging.INFO,
+        logging.WARNING if fit.convergence == Convergence.STALLED else logging.INFO,
         "%s: %d steps accepted, %d refused, %d frames stalled",
-        convergence.value,
-        rounds.steps,
-        rounds.refused,
-        rounds.stalled.sum(),
+        fit.convergence.value,
+        fit.steps,
+        fit.refused,
+        fit.stalled.sum(),
     )
-    faults = FrameFaults.of(inputs, state, stalled, assembly.contradicted())
-    assembly.body.compare(state)
-    return _WindowFit(
-        state=state,
-        contact=rounds.estimate,
-        residuals=assembly.body.residuals(),
-        energy_before=rounds.energy_before,
-        energy_after=rounds.energy_after,
-        steps=rounds.steps,
-        refused=rounds.refused,
-        convergence=convergence,
-        faults=faults,
-        last_step_m=rounds.last_step_m,
-        last_decrease=rounds.last_decrease,
-    )
+    stalled = fit.stalled | (fit.convergence == Convergence.STALLED)
+    fit.faults = FrameFaults.of(inputs, fit.state, stalled, assembly.contradicted())
+    assembly.body.compare(fit.state)
+    fit.residuals = assembly.body.residuals()
+    return fit
 
 
 def _joined(
@@ -224,62 +250,6 @@ def _joined(
         last_step_m=max(fit.last_step_m for fit in fits),
         last_decrease=max(fit.last_decrease for fit in fits),
     )
-
-
-class _Rounds:
-    """State, contact and statistics of the rounds so far; see :class:`_WindowFit` for the fields.
-
-    ``stalled`` (T,) are frames that no round moved, since each step raised the energy there.
-    """
-
-    def __init__(
-        self,
-        geometry: Geometry,
-        assembly: Assembly,
-        start: State,
-        contact_at: Callable[[State], ContactEstimate],
-    ) -> None:
-        self._assembly, self._contact_at = assembly, contact_at
-        self._geometry = geometry
-        self.state = start
-        self.estimate = contact_at(start)
-        self.steps = self.refused = 0
-        self.stalled = np.ones(len(start), bool)
-        self.energy_before: dict[str, np.ndarray] = {}
-        self.energy_after: dict[str, np.ndarray] = {}
-        self.last_step_m = self.last_decrease = 0.0
-        self._unchanged = False  # the last round hardly changed state and contact
-
-    @property
-    def convergence(self) -> Convergence:
-        """Outcome so far."""
-        if self._unchanged:
-            return Convergence.CONVERGED
-        if self.steps == 0 and self.refused > 0:
-            return Convergence.STALLED
-        return Convergence.ITERATION_LIMIT
-
-    def minimise(self, max_steps: int) -> None:
-        """Update correspondences, minimise, and estimate contact again."""
-        assembly, before = self._assembly, self.state
-        if assembly.contact is not None:
-            assembly.contact.take_contact(self.estimate.probability, self.estimate.labels)
-        assembly.problem.refresh(before)
-        minimum = minimise(assembly.problem, before, max_steps=max_steps)
-        self.state = minimum.state
-        self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
-        self.energy_before = self.energy_before or minimum.energies_before
-        self.energy_after = minimum.energies
-        self.last_step_m = _displacement(self._geometry, minimum.previous, minimum.state)
-        self.last_decrease = minimum.decrease
-        self.stalled &= minimum.stalled
-        log.info("%d steps, energy %.4g", self.steps, sum(map(np.sum, minimum.energies.values())))
-        settled = minimum.converged or minimum.steps > 0  # not each step was refused
-        previous, self.estimate = self.estimate, self._contact_at(self.state)
-        changed_m = _displacement(self._geometry, before, self.state)
-        contact_change = self.estimate.change(previous)
-        # the limit of the contact probability is tuned on the studio
-        self._unchanged = settled and changed_m < UNCHANGED_M and contact_change < 0.1
 
 
 def _displacement(geometry: Geometry, before: State, after: State) -> float:
