@@ -116,11 +116,12 @@ class Hypotheses:
 
     Attributes:
         fits: hypotheses [T] in the order in which they were added.
+        prior: prior of the hypotheses.
     """
 
-    def __init__(self, observer: Observer, prior: Prior) -> None:
+    def __init__(self, observer: Observer) -> None:
         self._observer = observer
-        self._prior = prior
+        self.prior = Prior(observer)
         self._times = observer.times
         self._patience = observer.frames_in(UNSEEN_S)
         self.fits: list[list[FittedPose]] = [[] for _ in range(observer.count)]
@@ -139,7 +140,7 @@ class Hypotheses:
 
     def best(self, t: int) -> float:
         """Return the evidence of frame t's likeliest hypothesis (:meth:`Prior.weigh`), or 0."""
-        return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
+        return float(self.prior.weigh(t, self.fits[t]).max(initial=0.0))
 
     def add(self, t: int, fit: FittedPose) -> None:
         """Add a hypothesis to frame t.
@@ -164,7 +165,7 @@ class Hypotheses:
         3. All hypotheses.
         """
         own, mesh = self.fits[t], self._observer.mesh
-        order = [int(k) for k in np.argsort(self._prior.weigh(t, own))]
+        order = [int(k) for k in np.argsort(self.prior.weigh(t, own))]
         if own[order[0]].log_ratio < SEEN_LOG_RATIO < own[order[-1]].log_ratio:
             return order[0]
         for i, k in enumerate(order):
@@ -237,7 +238,7 @@ class Hypotheses:
             fit = self._fit(t, predicted, prior, twist)
             if self.seen(t, fit.pose) is not None:
                 return
-            weights = self._prior.weigh(t, [fit, *self.fits[t]])
+            weights = self.prior.weigh(t, [fit, *self.fits[t]])
             if fit.log_ratio > CONTRADICTED_LOG_RATIO:
                 self.add(t, fit)
             deficit += self._observer.share * float(weights.max(initial=0.0) - weights[0])

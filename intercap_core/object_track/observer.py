@@ -97,9 +97,8 @@ class Observer:
 
     def frames_to_search(self) -> list[int]:
         """Return all frames, the most promising first."""
-        first = self._survey[1]
-        known = set(first)
-        return first + [t for t in rank_frames(self.labels_by_view, self.labels) if t not in known]
+        ranked = rank_frames(self.labels_by_view, self.labels)
+        return list(dict.fromkeys([*self._survey[1], *ranked]))
 
     def count_promising_views(self, t: int) -> int:
         """Count the views of frame t with a candidate that has no label or one of the object."""

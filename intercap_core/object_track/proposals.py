@@ -15,7 +15,7 @@ from intercap_core.geometry.solve.time_series import nearest, runs
 from intercap_core.object_track.decoder import HIDDEN, Decoded
 from intercap_core.object_track.fit import AT_REST, FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses, Prior
+from intercap_core.object_track.hypotheses import RIVAL_LOG_RATIO, Hypotheses
 from intercap_core.object_track.likelihood import DECISIVE_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
@@ -43,10 +43,10 @@ class NotFound(Exception):
 class Proposals:
     """Adds hypotheses to the frames of a recording."""
 
-    def __init__(self, observer: Observer, hypotheses: Hypotheses, prior: Prior) -> None:
+    def __init__(self, observer: Observer, hypotheses: Hypotheses) -> None:
         self._observer = observer
         self._hypotheses = hypotheses
-        self._prior = prior
+        self._prior = hypotheses.prior
         self._times = observer.times
         self._reach = observer.frames_in(0.3)
         self._searched: set[int] = set()

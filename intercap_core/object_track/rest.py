@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import rotation_exp, step_between
-from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
+from intercap_core.object_track.evidence import FrameEvidence
 
 # Longest rest of the partition, half a minute at 30 Hz. It limits the run time, which grows with
 # the square of a rest's length; a minute at rest takes 1.5 times as long without it.
@@ -23,25 +23,23 @@ MAX_REST_FRAMES = 900
 POSE_COST = 9.0  # tuned
 
 
-def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def find_rests(evidence: FrameEvidence, share: float, centre: np.ndarray) -> np.ndarray:
     """Find the frames at rest.
 
     Frames without evidence rest if those around them rest at one pose. Returns the number (T,) of
-    the rest segment from 0, -1 while the object moves. ``centre`` (3,) is that of the object.
+    the rest segment from 0, -1 while the object moves. ``share`` is the number of independent
+    observations per frame, ``centre`` (3,) is that of the object.
     """
     evidence = evidence.about(centre)
-    count = len(times)
     own = evidence.own
     poses = evidence.poses.copy()
     poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
     information = evidence.information
     seen = np.trace(information, axis1=1, axis2=2) > 0
-    step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
-    share = min(1.0, step / ERROR_LASTING_S)
     shortest = max(3, int(1 / share))  # frames: one independent observation
     variance = 1.0
-    segments = np.full(count, -1)
+    segments = np.full(len(poses), -1)
     for _ in range(2):
         segments, spread = _partition(poses, information, seen, share / variance, share, shortest)
         if spread is None:

@@ -32,7 +32,6 @@ from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import (
     ANNOTATED_REACH_M,
     Hypotheses,
-    Prior,
     group_by_candidates,
 )
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
@@ -86,9 +85,9 @@ class Tracker:
         self._mesh = observer.mesh
         count = observer.count
         self._hands = [estimate_hand_motions(observer.joints[t : t + 2]) for t in range(count - 1)]
-        self._prior = Prior(observer)
-        self._hypotheses = Hypotheses(observer, self._prior)
-        self._proposals = Proposals(observer, self._hypotheses, self._prior)
+        self._hypotheses = Hypotheses(observer)
+        self._prior = self._hypotheses.prior
+        self._proposals = Proposals(observer, self._hypotheses)
         self._colours = ColourDecision(observer, self._hypotheses)
 
     def run(self, annotated: Sequence[GivenPose] = ()) -> Track:

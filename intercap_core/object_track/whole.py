@@ -332,7 +332,7 @@ class WholeTrack:
                 gradient[t] = own.gradient.sum(0) / noise
         combined = self._without_symmetry(FrameEvidence(evaluated, information, gradient))
         centre = self._mesh.centre_of_mass
-        segment = find_rests(combined, self._times, centre)
+        segment = find_rests(combined, self._observer.share, centre)
         segment[stated.exclude_from_rests(self._mesh, evaluated, segment)] = -1
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])

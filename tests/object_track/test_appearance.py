@@ -14,7 +14,7 @@ from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.appearance import patches_of
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.decoder import Decoded, MarkovModel, mix_decisions
-from intercap_core.object_track.hypotheses import Hypotheses, Prior
+from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.view import View
 from tests.helpers.object_capture import ObjectCapture
@@ -88,7 +88,7 @@ def observe(toolbox, views) -> Callable[..., Observer]:
 
 def decide(observer: Observer, capture: ObjectCapture, open_frames: set[int]) -> Decoded:
     """Result with colours if the images of ``open_frames`` do not decide a half turn."""
-    hypotheses = Hypotheses(observer, Prior(observer))
+    hypotheses = Hypotheses(observer)
     emissions, steps = [], []
     for t, pose in enumerate(capture.poses):
         hypotheses.fits[t] = observer.assess_all(t, np.array([pose, pose @ HALF_TURN]))

@@ -12,7 +12,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.camera.transforms import apply_step, rigid, step_between
 from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import FittedPose, seen_by
-from intercap_core.object_track.hypotheses import MAX_HYPOTHESES, Hypotheses, Prior
+from intercap_core.object_track.hypotheses import MAX_HYPOTHESES, Hypotheses
 from intercap_core.object_track.motion import (
     estimate_hand_motions,
     predict_prior,
@@ -109,7 +109,7 @@ def observer(swung) -> Observer:
 
 
 def hypotheses_of(observer: Observer) -> Hypotheses:
-    return Hypotheses(observer, Prior(observer))
+    return Hypotheses(observer)
 
 
 def decided_first(counts: list[int]) -> Decoded:

@@ -7,13 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply_step, rigid
-from intercap_core.object_track.evidence import FrameEvidence
+from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 from intercap_core.object_track.rest import find_rests
 from intercap_core.object_track.smooth import smooth
 
 SIGMA = np.repeat([np.radians(1.0), 0.003], 3)
 CENTRE = np.array([0.02, -0.01, 0.05])
 FPS = 15.0
+SHARE = 1 / FPS / ERROR_LASTING_S  # independent observations per frame
 
 
 def evidence_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> FrameEvidence:
@@ -91,7 +92,7 @@ def test_short_recordings_are_smoothed(count: int) -> None:
     true = lifted(10, 8, 9)[:count]
     evidence = evidence_at(true)
     times = np.arange(count) / FPS
-    segment = find_rests(evidence, times, CENTRE)
+    segment = find_rests(evidence, SHARE, CENTRE)
     found, covariance = smooth(evidence, evidence.poses, np.arange(count), times, CENTRE)
     assert segment.shape == (count,)
     assert shift(found, true).max() < 0.015
@@ -103,7 +104,7 @@ def test_rests_end_with_the_motion(fps: float, seed: int) -> None:
     starts, stops, count = round(1.3 * fps), round(2.2 * fps), round(3.5 * fps)
     true = lifted(count, starts, stops)
     evidence = evidence_at(true, seed=seed)
-    segment = find_rests(evidence, np.arange(count) / fps, CENTRE)
+    segment = find_rests(evidence, 1 / fps / ERROR_LASTING_S, CENTRE)
     assert segment.max() == 1
     away = shift(true, np.tile(true[:1], (count, 1, 1)))
     first = np.flatnonzero(segment == 0)
@@ -122,7 +123,7 @@ def test_lasting_errors_are_no_motion() -> None:
     # masks wrong by about one standard deviation for half a second at a time
     wrong = np.repeat(rng.normal(size=(11, 6)) * SIGMA, 5, axis=0)
     evidence.gradient[:] -= np.einsum("tij,tj->ti", evidence.information, wrong)
-    segment = find_rests(evidence, np.arange(55) / FPS, CENTRE)
+    segment = find_rests(evidence, SHARE, CENTRE)
     assert (segment == 0).all()
     found, covariance = smooth(
         evidence, evidence.poses, np.zeros(55, int), np.arange(55) / FPS, CENTRE
@@ -136,7 +137,7 @@ def test_lasting_errors_are_no_motion() -> None:
 def test_slow_motion_is_no_rest() -> None:
     true = lifted(45, 0, 44)
     true[:, 1, 3] = 0.1 + 0.05 * np.arange(45) / FPS  # five centimetres a second
-    segment = find_rests(evidence_at(true), np.arange(45) / FPS, CENTRE)
+    segment = find_rests(evidence_at(true), SHARE, CENTRE)
     assert (segment == -1).all()
 
 
@@ -145,14 +146,14 @@ def test_wrong_frames_do_not_end_a_rest(width: int) -> None:
     true = lifted(40, 38, 39)[:30]
     evidence = evidence_at(true)
     evidence.poses[12 : 12 + width, :3, 3] += [0.1, 0.0, 0.02]
-    segment = find_rests(evidence, np.arange(30) / FPS, CENTRE)
+    segment = find_rests(evidence, SHARE, CENTRE)
     assert (segment == 0).all()
 
 
 def test_a_long_rest_is_one_segment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("intercap_core.object_track.rest.MAX_REST_FRAMES", 20)
     true = lifted(60, 58, 59)[:55]
-    assert (find_rests(evidence_at(true), np.arange(55) / FPS, CENTRE) == 0).all()
+    assert (find_rests(evidence_at(true), SHARE, CENTRE) == 0).all()
 
 
 @pytest.mark.parametrize("at_end", [False, True])
@@ -165,7 +166,7 @@ def test_rests_cut_by_the_recording_are_found(at_end: bool) -> None:
         true[:still, 1, 3] = 0.1
         if at_end:
             true = true[::-1].copy()
-        segment = find_rests(evidence_at(true), np.arange(len(true)) / FPS, CENTRE)
+        segment = find_rests(evidence_at(true), SHARE, CENTRE)
         rests = segment[::-1][:still] if at_end else segment[:still]
         found.append(int((rests >= 0).sum()))
     assert (np.diff(found) >= 0).all(), "longer rests are found as longer"

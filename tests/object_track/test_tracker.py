@@ -15,7 +15,7 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.object_track.decoder import HIDDEN, Decoded
 from intercap_core.object_track.fit import FittedPose
-from intercap_core.object_track.hypotheses import Hypotheses, Prior
+from intercap_core.object_track.hypotheses import Hypotheses
 from intercap_core.object_track.proposals import Proposals
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.whole import FrameResult
@@ -53,11 +53,10 @@ def test_frames_are_searched_if_the_object_is_hidden_in_all(suitcase, capture, i
     """The first frames that were searched may have shown nothing of it."""
     observer = observer_of(capture, images)
     observer.places.claim(suitcase.centre_at(capture.poses[0]))
-    prior = Prior(observer)
-    hypotheses = Hypotheses(observer, prior)
+    hypotheses = Hypotheses(observer)
     count = len(images)
     nothing = Decoded(np.full(count, HIDDEN), [np.ones(1)] * count, np.zeros(count), 0.0)
-    assert Proposals(observer, hypotheses, prior).search_uncertain(nothing)
+    assert Proposals(observer, hypotheses).search_uncertain(nothing)
     shift, turn = min(
         np.abs(step_between(fit.pose, pose)).reshape(2, 3).max(1)[::-1].tolist()
         for fits, pose in zip(hypotheses.fits, capture.poses, strict=True)
