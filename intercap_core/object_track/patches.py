@@ -27,10 +27,8 @@ OUTSIDE_MASK_WEIGHT = 0.3  # of depth pixels outside of the candidate; tuned on 
 class DepthPatch:
     """Measured points in a window of the reduced depth image."""
 
-    x0: int
-    """Column of the first pixel in the reduced depth image."""
-    y0: int
-    """Row of the first pixel."""
+    corner: tuple[int, int]
+    """First pixel (x, y) in the reduced depth image."""
     depth: np.ndarray
     """(h, w) metres, 0 where invalid."""
     points: np.ndarray
@@ -60,17 +58,15 @@ class DepthPatch:
             geometry.camera.master_from_depth, geometry.lens.parameters,
             mask.placed, view.person.placed,
         )  # fmt: skip
-        return cls(left, top, depth, points, trust)
+        return cls((left, top), depth, points, trust)
 
 
 @dataclass(frozen=True, eq=False)
 class ContourPatch:
     """The candidate's mask in a window of the reduced colour image."""
 
-    x0: int
-    """Column of the first pixel in the reduced colour image."""
-    y0: int
-    """Row of the first pixel."""
+    corner: tuple[int, int]
+    """First pixel (x, y) in the reduced colour image."""
     inside: np.ndarray
     """(h, w) bool, the mask."""
     person: np.ndarray
@@ -96,12 +92,12 @@ class ContourPatch:
         border, starts = rim_pixels(inside)
         if not len(border):
             return None
-        return cls(left, top, inside, person, border, starts, _own(border, person))
+        return cls((left, top), inside, person, border, starts, _own(border, person))
 
     def holds(self, image: Rendering) -> bool:
         """Return whether a rendering lies inside the window."""
         height, width = image.face.shape
-        left, top = image.x0 - self.x0, image.y0 - self.y0
+        left, top = image.x0 - self.corner[0], image.y0 - self.corner[1]
         fits_in_width = 0 <= left <= self.inside.shape[1] - width
         return fits_in_width and 0 <= top <= self.inside.shape[0] - height
 

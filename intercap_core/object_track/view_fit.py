@@ -123,7 +123,7 @@ class ViewFit:
         if patch is None or drawn is None:
             return np.zeros((6, 6)), np.zeros(6)
         hessian, gradient, count = object_depth.normal_equations(
-            drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+            drawn.depth, drawn.face, (drawn.x0 - patch.corner[0], drawn.y0 - patch.corner[1]),
             patch.depth, patch.points, patch.trust, self._context.mesh.face_normals,
             self._pose[:3, :3], self._pose[:3, 3],
             self._view.geometry.camera.master_from_depth[:3, 3], GATE_SCALES * scale_m, scale_m,
@@ -150,7 +150,7 @@ class ViewFit:
         scale = scale_px / geometry.step
         corner = (drawn.x0, drawn.y0)
         at, target, missed, rim_size = object_silhouette.correspondences(
-            drawn.face, corner, patch.inside, patch.person, (patch.x0, patch.y0), patch.contour,
+            drawn.face, corner, patch.inside, patch.person, patch.corner, patch.contour,
             patch.rim, patch.starts, background, GATE_SCALES * scale, MIN_RENDERED_PX,
         )  # fmt: skip
         # The first ``missed`` matches are those of mask pixels that the rendering misses. The
@@ -160,7 +160,7 @@ class ViewFit:
         if measured is not None and lens is not None and missed < len(at):
             clear = object_silhouette.sees_past(
                 at[missed:], drawn.depth, corner, geometry.lens.rays, geometry.depth_from_colour,
-                lens.parameters, measured.depth, (measured.x0, measured.y0), FREE_SPACE_M,
+                lens.parameters, measured.depth, measured.corner, FREE_SPACE_M,
             )  # fmt: skip
             kept = np.concatenate([np.ones(missed, bool), clear])
             at, target = at[kept], target[kept]
@@ -190,7 +190,7 @@ class ViewFit:
         patch, drawn = self._depth_patch, self._drawn_depth
         if patch is not None and drawn is not None:
             gap, across, where = object_depth.matches(
-                drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+                drawn.depth, drawn.face, (drawn.x0 - patch.corner[0], drawn.y0 - patch.corner[1]),
                 patch.depth, patch.points, self._context.mesh.face_normals,
                 self._pose[:3, :3], self._view.geometry.camera.master_from_depth[:3, 3],
             )  # fmt: skip

@@ -75,7 +75,6 @@ def find_disagreements(
     bad = [c for c, part in enumerate(parts) if part is not None or not agrees[c]]
     if not bad:
         return []
-    causes = dict.fromkeys(bad, UNDETERMINED)
     if exchanged := _exchanged(keypoints, rig, bad):
         first, second = (rig.names[c] for c in exchanged)
         words = f"poses, or images, of {first} and {second} are exchanged in the input"
