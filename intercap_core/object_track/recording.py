@@ -86,10 +86,7 @@ class ObjectRecording:
     def view(self, t: int, place: int) -> View:
         """Return the view of camera number ``place`` among :attr:`cameras` at moment t."""
         c = self.cameras[place]
-        candidates = [
-            (candidate.index, candidate.label, candidate.rle)
-            for candidate in self._candidates(t, c)
-        ]
+        candidates = [(item.index, item.label, item.rle) for item in self._candidates(t, c)]
         depth = self._frames.depth(t, c)
         detected = bool(self._detections.candidates_found[t, c])
         geometry, room = self.geometry[place], self._rooms[place]

@@ -13,7 +13,6 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer, default_renderer
 from intercap_core.object_track.reduced_mask import (
-    EMPTY,
     ReducedMask,
     decode,
     reduced_lens,
@@ -190,7 +189,7 @@ class View:
             MaskCandidate(index, label, decode(rle, colour, step))
             for index, label, rle in candidates
         )
-        person = decode(person_rle, colour, step) if person_rle else EMPTY
+        person = decode(person_rle, colour, step)
         parts = tuple(
             replace(candidate, mask=part)
             for candidate in whole
