@@ -29,11 +29,7 @@ from intercap_core.object_track.decoder import (
 )
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.hypotheses import (
-    ANNOTATED_REACH_M,
-    Hypotheses,
-    group_by_candidates,
-)
+from intercap_core.object_track.hypotheses import ANNOTATED_REACH_M, Hypotheses, group_by_candidates
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.mesh_check import mesh_doubts
 from intercap_core.object_track.motion import estimate_hand_motions

@@ -12,12 +12,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer, default_renderer
-from intercap_core.object_track.reduced_mask import (
-    ReducedMask,
-    decode,
-    reduced_lens,
-    remove_person,
-)
+from intercap_core.object_track.reduced_mask import ReducedMask, decode, reduced_lens, remove_person
 
 
 @dataclass(frozen=True, eq=False)
