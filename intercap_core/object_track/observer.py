@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,6 @@ from intercap_core.object_track.evidence import ERROR_LASTING_S, ImageEvidence, 
 from intercap_core.object_track.fit import AT_REST, FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.motion import estimate_hand_motions
 from intercap_core.object_track.places import Places
-from intercap_core.object_track.recording import ViewCache
 from intercap_core.object_track.search import rank_frames, search_pose
 from intercap_core.object_track.view import FitContext, View
 from intercap_core.progress import Progress
@@ -36,8 +35,8 @@ class Observer:
 
     mesh: ObjectMesh
     """Mesh that is rendered."""
-    load: Callable[[int], list[View]]
-    """Returns the views of frame t, one per camera."""
+    views: Callable[[int], list[View]]
+    """Returns the views of frame t, one per camera. It is called often, so that they are cached."""
     labels_by_view: list[list[list[str]]]
     """Labels of the candidates, [T][C][candidates]."""
     settings: ObjectTrackSettings
@@ -54,16 +53,15 @@ class Observer:
     """Colour images of the views."""
     paint: Paint | None = None
     """Colours of the mesh."""
-    views: Callable[[int], list[View]] = field(init=False)
-    """``load`` with a cache."""
-    context: FitContext = field(init=False)
-    """Object and settings of all fits."""
 
     def __post_init__(self) -> None:
-        self.views = ViewCache(self.load)
         self._progress = Progress(log, f"{self.mesh.name}: fitted", None, "poses")
+
+    @cached_property
+    def context(self) -> FitContext:
+        """Object and settings of all fits."""
         settings, renderer = self.settings, Renderer(threads_of_job())
-        self.context = FitContext(
+        return FitContext(
             self.mesh, self.labels, settings.min_overlap, settings.background_term, renderer
         )
 

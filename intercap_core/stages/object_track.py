@@ -24,7 +24,7 @@ from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.mesh_check import label_doubt, size_doubt
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import NotFound
-from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
+from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording, ViewCache
 from intercap_core.object_track.tracker import NOTHING_LOG_RATIO, Track, Tracker
 from intercap_core.schemas import OBJECT_TRACK
 
@@ -69,7 +69,7 @@ def run(
             )
         observer = Observer(
             mesh.simplified(TRACKING_FACES),
-            source.views,
+            ViewCache(source.views),
             source.labels(),
             settings,
             recording.time_s,

@@ -59,7 +59,7 @@ def observer_of(
         "up": capture.master_from_room[:3, 2],
     }
     return Observer(
-        load=images.__getitem__, labels_by_view=labels, settings=ObjectTrackSettings(),
+        views=images.__getitem__, labels_by_view=labels, settings=ObjectTrackSettings(),
         **(given | options),
     )  # fmt: skip
 
