@@ -1,23 +1,17 @@
 """Latency of the annotation page in Chromium, from a key to the drawn views.
 
-    python -m bench.annotate_page [config/demo/config.yaml] [--sequence NAME] [--steps 30]
-        [--output results/bench.json]
-
 The arrow key is pressed with pauses, as by a person. A step ends when every view has drawn the new
-frame, the graphics process has finished and the browser has painted. Figures in the JSON:
+frame, the graphics process has finished and the browser has painted. Figures:
 
 - ``annotate.page_ms_per_step``: median of a step; ``..._p95`` the 95th percentile; ``..._3d`` the
   median until the 3D viewer has followed (at least two frames later).
 - ``annotate.page_ms_per_jump``: jump to the last frame, whose images are not prefetched.
 - ``annotate.page_ms_to_open``: from the address to the 4D viewer.
 - ``annotate.page_ms_per_edit``: time for which an edit blocks the page.
-
-Use config/evaluation/long.yaml, once computed, for a long sequence.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -30,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.command import replace_figures
 from intercap_core.errors import UserError
 
 if TYPE_CHECKING:
@@ -263,24 +256,3 @@ def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
         "annotate.page_ms_to_open": round(float(to_open), 1),
         "annotate.page_ms_per_edit": round(float(np.median(edits)), 1),
     }
-
-
-def main() -> None:
-    """Measure, print, and add the figures to the output."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/demo/config.yaml"))
-    parser.add_argument("--sequence", default="cup_drink_s02")
-    parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    options = parser.parse_args()
-    try:
-        found = measure(options.settings, options.sequence, options.steps)
-    except UserError as error:
-        raise SystemExit(str(error)) from None
-    for name, value in found.items():
-        print(f"{name}: {value}")
-    replace_figures(options.output, found, ("annotate.page_",))
-
-
-if __name__ == "__main__":
-    main()
