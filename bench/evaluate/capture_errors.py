@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.evaluation.scene_errors import displacement, rig_centre
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
@@ -33,8 +35,7 @@ class Slip:
     """Lag in frame sets; positive = late."""
 
 
-@dataclass(frozen=True)
-class SlipCounts:
+class SlipCounts(NamedTuple):
     """Detection of slips, counted by event and by image."""
 
     found: int
@@ -205,7 +206,7 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
         )
 
 
-def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
+def figures(captures: Sequence[CaptureErrors]) -> Figures:
     """Figures over several captures, in millimetres, milliseconds and degrees.
 
     Extrinsics are separate for rooms with furniture and for bare floors (``floor_only``). The
@@ -214,49 +215,42 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
     """
     if not captures:
         return {}
-    found: dict[str, float] = {"captures": float(len(captures))}
+    found: Figures = {"captures": float(len(captures))}
     for name, bare in (("extrinsics", False), ("extrinsics_floor_only", True)):
-        group = [c for c in captures if (c.room == "bare") == bare]
-        before = 1e3 * _joined([c.before for c in group])
-        after = 1e3 * _joined([c.after for c in group])
-        if len(after):
-            found[f"{name}_before_mm"] = float(before.mean())
-            found[f"{name}_after_mm" if not bare else f"{name}_mm"] = float(after.mean())
-            found[f"{name}_worst_capture_mm"] = max(
-                1e3 * float(c.after.mean()) for c in group if len(c.after)
-            )
-            found[f"{name}_worst_camera_mm"] = float(after.max())
-    several = [c for c in captures if len(c.after)]
-    if several:
-        change = np.array([c.after.mean() - c.before.mean() for c in several])
-        found["extrinsics_improved_share"] = float((change < -1e-6).mean())
-        found["extrinsics_worse_share"] = float((change > 1e-6).mean())
-    offset = _joined([c.offset for c in captures])
-    if len(offset):
-        found["offset_error_ms"] = 1e3 * float(np.abs(offset).mean())
-        found["offset_error_worst_ms"] = 1e3 * float(np.abs(offset).max())
-    normalised = _joined([c.offset_normalised for c in captures])
-    if np.isfinite(normalised).any():
-        ratio = SIGMA_PER_MAD * float(np.nanmedian(np.abs(normalised)))
-        found["offset_normalised_median"] = ratio
-    if len(offset):
-        found["offset_estimated_share"] = float(np.isfinite(normalised).mean())
-    found["slips_true"] = float(sum(c.slips.found + c.slips.missed for c in captures))
-    found["slips_missed"] = float(sum(c.slips.missed for c in captures))
-    found["slips_false"] = float(sum(c.slips.false for c in captures))
-    images = sum(c.slips.images for c in captures)
-    if images:
-        found["slips_images_wrong_share"] = sum(c.slips.images_wrong for c in captures) / images
+        group = [c for c in captures if (c.room == "bare") == bare and len(c.after)]
+        before, after = (1e3 * _joined([getattr(c, n) for c in group]) for n in ("before", "after"))
+        found |= {
+            f"{name}_before_mm": over_known(np.mean, before),
+            f"{name}_mm" if bare else f"{name}_after_mm": over_known(np.mean, after),
+            f"{name}_worst_capture_mm": 1e3 * over_known(np.max, [c.after.mean() for c in group]),
+            f"{name}_worst_camera_mm": over_known(np.max, after),
+        }
+    change = np.array([c.after.mean() - c.before.mean() for c in captures if len(c.after)])
+    offset = np.abs(_joined([c.offset for c in captures]))
+    normalised = np.abs(_joined([c.offset_normalised for c in captures]))
+    slips = SlipCounts(*np.sum([c.slips for c in captures], axis=0).tolist())
     height = np.array([c.ground_m for c in captures])
-    found["ground_missing_share"] = float(np.isnan(height).mean())
-    if np.isfinite(height).any():
-        found["ground_error_mm"] = 1e3 * float(np.nanmean(height))
-        found["ground_error_worst_mm"] = 1e3 * float(np.nanmax(height))
-        found["ground_error_deg"] = float(np.nanmean([c.ground_deg for c in captures]))
-    bias = _joined([c.depth_bias for c in captures])
-    if np.isfinite(bias).any():
-        found["depth_bias_error_mm"] = 1e3 * float(np.nanmean(np.abs(bias)))
-    return found
+    bias = np.abs(_joined([c.depth_bias for c in captures]))
+    return finite(
+        found
+        | {
+            "extrinsics_improved_share": over_known(np.mean, change < -1e-6),
+            "extrinsics_worse_share": over_known(np.mean, change > 1e-6),
+            "offset_error_ms": 1e3 * over_known(np.mean, offset),
+            "offset_error_worst_ms": 1e3 * over_known(np.max, offset),
+            "offset_normalised_median": SIGMA_PER_MAD * over_known(np.nanmedian, normalised),
+            "offset_estimated_share": over_known(np.mean, np.isfinite(normalised)),
+            "slips_true": float(slips.found + slips.missed),
+            "slips_missed": float(slips.missed),
+            "slips_false": float(slips.false),
+            "slips_images_wrong_share": slips.images_wrong / max(slips.images, 1),
+            "ground_missing_share": float(np.isnan(height).mean()),
+            "ground_error_mm": 1e3 * over_known(np.nanmean, height),
+            "ground_error_worst_mm": 1e3 * over_known(np.nanmax, height),
+            "ground_error_deg": over_known(np.nanmean, [c.ground_deg for c in captures]),
+            "depth_bias_error_mm": 1e3 * over_known(np.nanmean, bias),
+        }
+    )
 
 
 def _true_bias(truth: artefacts.Artefact) -> np.ndarray:

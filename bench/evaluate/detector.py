@@ -37,6 +37,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -66,13 +67,8 @@ class TrueAndStated(NamedTuple):
     def rms(self) -> tuple[float, float]:
         """Root mean square of the known errors, and of their known standard deviations."""
         known = np.isfinite(self.error)
-        error, sigma = (
-            float(np.sqrt(np.mean(values[known & np.isfinite(values)] ** 2)))
-            if (known & np.isfinite(values)).any()
-            else float("nan")
-            for values in self
-        )
-        return error, sigma
+        error, sigma = (np.sqrt(over_known(np.mean, v[known & np.isfinite(v)] ** 2)) for v in self)
+        return float(error), float(sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +195,7 @@ def figures(recordings: Sequence[DetectorSequence]) -> Figures:
     found = areas([recording.metrics for recording in recordings])
     result = {name: found[area][key] for name, (area, key) in FIGURES.items() if key in found[area]}
     slips = [slip for recording in recordings for slip in recording.slip_m]
-    if slips:
-        result["grip_slip_mm"] = 1e3 * float(np.mean(slips))
+    result |= finite({"grip_slip_mm": 1e3 * over_known(np.mean, slips)})
     for name in (f.name for f in fields(CameraErrors)):
         every = [getattr(recording.cameras, name) for recording in recordings]
         pooled = TrueAndStated(*(np.concatenate(values) for values in zip(*every, strict=True)))

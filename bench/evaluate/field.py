@@ -31,6 +31,7 @@ from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES, JOINT, SCENE, TRUTH
@@ -157,10 +158,11 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
         suffix = "" if stage == "joint" else f"_{stage}"
         for key in _BEAM_KEYS:
             values = figures.pooled(on_beam, f"truth/{stage}/{key}")
-            if values is not None and np.isfinite(values).any():
+            if values is not None:
                 unit = "mm_s" if key == "planted_speed" else "mm"
                 name = key.removeprefix("body_").removesuffix("_speed")
-                found[f"field.beam_{name}_{unit}{suffix}"] = 1e3 * float(np.nanmean(values))
+                mean = 1e3 * over_known(np.nanmean, values)
+                found |= finite({f"field.beam_{name}_{unit}{suffix}": mean})
     found |= _up_figures([e.up for some in evaluations for e in some.errors if e.up is not None])
     several = [found for found in evaluations if found.dataset == PASSER_BY]
     if several:

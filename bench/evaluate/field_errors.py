@@ -17,6 +17,7 @@ from bench.evaluate.start_windows import WindowErrors
 from intercap_core import artefacts
 from intercap_core.body.joints import FOOT_JOINTS, JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.scene_errors import CUBE_SIDE_M, displacement, rig_centre
 from intercap_core.evaluation.truth import match_times
@@ -156,7 +157,7 @@ def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) 
     return result
 
 
-def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+def start_figures(scenes: Sequence[FieldScene]) -> Figures:
     """Figures of recordings whose cameras started at different times; milliseconds.
 
     A camera is solved if the error of its delay is below half a frame period. ``offset_wrong``
@@ -169,27 +170,25 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
         np.concatenate([getattr(s, name) for s in scenes])
         for name in ("late_s", "sigma_s", "set_aside")
     )
-    late, step = (
-        np.abs(late),
-        np.repeat([1 / s.fps for s in scenes], [len(s.late_s) for s in scenes]),
-    )
+    late = np.abs(late)
+    step = np.repeat([1 / s.fps for s in scenes], [len(s.late_s) for s in scenes])
     solved = ~aside & (late < step / 2)
-    found = {
-        "offset_solved_share": float(solved.mean()),
-        "offset_wrong": float((~solved & ~aside).sum()),
-        "offset_cameras": float(len(late)),
-    }
-    if solved.any():
-        found["offset_error_ms"] = 1e3 * float(late[solved].mean())
-        found["offset_error_worst_ms"] = 1e3 * float(late[solved].max())
     known = solved & (sigma > 0)
-    if known.any():
-        found["offset_sigma_ms"] = 1e3 * float(np.median(sigma[known]))
-        found["offset_normalised"] = SIGMA_PER_MAD * float(np.median(late[known] / sigma[known]))
-    return found
+    ratio = late[known] / sigma[known]
+    return finite(
+        {
+            "offset_solved_share": float(solved.mean()),
+            "offset_wrong": float((~solved & ~aside).sum()),
+            "offset_cameras": float(len(late)),
+            "offset_error_ms": 1e3 * over_known(np.mean, late[solved]),
+            "offset_error_worst_ms": 1e3 * over_known(np.max, late[solved]),
+            "offset_sigma_ms": 1e3 * over_known(np.median, sigma[known]),
+            "offset_normalised": SIGMA_PER_MAD * over_known(np.median, ratio),
+        }
+    )
 
 
-def fault_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+def fault_figures(scenes: Sequence[FieldScene]) -> Figures:
     """Mean share of the cameras at fault that were named, in variants with moved or exchanged
     cameras or another calibration; and the number of correct cameras that were named."""
     faults = [fault for scene in scenes for fault in scene.faults]
@@ -202,7 +201,7 @@ def fault_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     }
 
 
-def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+def floor_figures(scenes: Sequence[FieldScene]) -> Figures:
     """Errors of camera poses in rooms whose measured surface is mostly floor, millimetres.
 
     ``extrinsics_normalised``: median of error over stated deviation.
@@ -213,18 +212,18 @@ def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
         np.concatenate([getattr(s, name) for s in scenes]) for name in ("before", "after", "stated")
     )
     known = stated > 0
-    found = {
-        "extrinsics_floor_heavy_given_mm": 1e3 * float(before.mean()),
-        "extrinsics_floor_heavy_mm": 1e3 * float(after.mean()),
-        "extrinsics_floor_heavy_worst_mm": 1e3 * float(after.max()),
-        "extrinsics_worse_cameras": float(sum(s.worse.sum() for s in scenes)),
-    }
-    if known.any():
-        found["extrinsics_normalised"] = float(np.median(after[known] / stated[known]))
-    return found
+    return finite(
+        {
+            "extrinsics_floor_heavy_given_mm": 1e3 * float(before.mean()),
+            "extrinsics_floor_heavy_mm": 1e3 * float(after.mean()),
+            "extrinsics_floor_heavy_worst_mm": 1e3 * float(after.max()),
+            "extrinsics_worse_cameras": float(sum(s.worse.sum() for s in scenes)),
+            "extrinsics_normalised": over_known(np.median, after[known] / stated[known]),
+        }
+    )
 
 
-def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
+def beam_figures(scenes: Sequence[FieldScene]) -> Figures:
     """Floor errors of recordings in which feet leave the floor, such as on a balance beam.
 
     Millimetres and degrees; ``beam_floor_missing`` counts the recordings without a floor.
@@ -232,12 +231,14 @@ def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     if not scenes:
         return {}
     height = np.array([s.floor_m for s in scenes])
-    found = {"beam_floor_missing": float(np.isnan(height).sum())}
-    if np.isfinite(height).any():
-        found["beam_floor_mm"] = 1e3 * float(np.nanmean(height))
-        found["beam_floor_worst_mm"] = 1e3 * float(np.nanmax(height))
-        found["beam_tilt_deg"] = float(np.nanmean([s.tilt_deg for s in scenes]))
-    return found
+    return finite(
+        {
+            "beam_floor_missing": float(np.isnan(height).sum()),
+            "beam_floor_mm": 1e3 * over_known(np.nanmean, height),
+            "beam_floor_worst_mm": 1e3 * over_known(np.nanmax, height),
+            "beam_tilt_deg": over_known(np.nanmean, [s.tilt_deg for s in scenes]),
+        }
+    )
 
 
 _LIMBS = [

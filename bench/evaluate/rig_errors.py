@@ -12,6 +12,7 @@ import numpy as np
 from bench.evaluate.scan_errors import align_points
 from intercap_core import artefacts
 from intercap_core.evaluation.body import vertex_error
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.evaluation.object_pose import posed_point
 from intercap_core.evaluation.scene_errors import CUBE_SIDE_M, displacement, rig_centre
 from intercap_core.evaluation.tracks import read_body, read_object
@@ -119,17 +120,13 @@ def figures(rigs: Sequence[RigErrors]) -> dict[str, float]:
     found = {"solved_share": float(np.mean([len(r.error) > 0 for r in rigs]))}
     for evidence in dict.fromkeys(r.evidence for r in rigs):
         errors = np.concatenate([r.error for r in rigs if r.evidence == evidence])
-        if len(errors):
-            found[f"pose_{evidence}_mm"] = 1e3 * float(errors.mean())
+        found[f"pose_{evidence}_mm"] = 1e3 * over_known(np.mean, errors)
     ratio = np.concatenate([r.error / r.sigma for r in rigs])
-    if len(ratio):
-        found["error_over_estimate_median"] = float(np.median(ratio))
-        found["error_within_twice_estimate_share"] = float((ratio <= 2).mean())
     chains = [r.chain for r in rigs if r.chain is not None]
-    if chains:
-        for part, errors in (
-            ("body_pve", np.array([c.body for c in chains])),
-            ("object", np.array([c.object_ for c in chains])),
-        ):
-            found[f"{part}_ratio"] = float(np.median(errors[:, 1] / errors[:, 0]))
-    return found
+    found |= {
+        "error_over_estimate_median": over_known(np.median, ratio),
+        "error_within_twice_estimate_share": over_known(np.mean, ratio <= 2),
+        "body_pve_ratio": over_known(np.median, [c.body[1] / c.body[0] for c in chains]),
+        "object_ratio": over_known(np.median, [c.object_[1] / c.object_[0] for c in chains]),
+    }
+    return finite(found)

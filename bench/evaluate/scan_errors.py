@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
@@ -196,19 +197,16 @@ def figures(scans: Sequence[ScanErrors]) -> dict[str, float]:
     if not scans:
         return {}
     solved = [scan for scan in scans if len(scan.to_truth)]
-    found = {
-        "solved_share": len(solved) / len(scans),
-        "watertight_share": float(np.mean([scan.watertight for scan in scans])),
-    }
-    if solved:
-        found["chamfer_mm"] = 1e3 * float(np.mean([scan.chamfer for scan in solved]))
-        found["p95_mm"] = 1e3 * float(np.mean([scan.p95 for scan in solved]))
-        before = [scan.before for scan in solved if np.isfinite(scan.before)]
-        if before:
-            found["before_mm"] = 1e3 * float(np.mean(before))
     ratios = [
         np.median(track.scanned) / np.median(track.given) for s in solved for track in s.tracks
     ]
-    if ratios:
-        found["object_ratio"] = float(np.exp(np.mean(np.log(ratios))))
-    return found
+    return finite(
+        {
+            "solved_share": len(solved) / len(scans),
+            "watertight_share": float(np.mean([scan.watertight for scan in scans])),
+            "chamfer_mm": 1e3 * over_known(np.mean, [scan.chamfer for scan in solved]),
+            "p95_mm": 1e3 * over_known(np.mean, [scan.p95 for scan in solved]),
+            "before_mm": 1e3 * over_known(np.nanmean, [scan.before for scan in solved]),
+            "object_ratio": float(np.exp(over_known(np.mean, np.log(ratios)))),
+        }
+    )

@@ -13,13 +13,8 @@ import numpy as np
 from bench.evaluate.part import grouped
 from intercap_core.evaluation import contact, motion
 from intercap_core.evaluation.contact_figures import RELIABILITY_BINS, reliability, stated_and_true
-from intercap_core.evaluation.figures import (
-    Figures,
-    SequenceMetrics,
-    finite,
-    object_figures,
-    pooled,
-)
+from intercap_core.evaluation.figures import SequenceMetrics, object_figures, pooled
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.schemas import METRIC_REGIONS
 
 
@@ -45,11 +40,10 @@ def detected_figures(
     """
     found = probability > 0.5
     counts = contact.confusion(found.T, true.T)
-    hits, false_alarms, misses = (float(n) for n in counts[:, :3].sum(0))
     near = distance < 0.03
     figures = {
-        "contact_detected_precision": _share(hits, hits + false_alarms),
-        "contact_detected_recall": _share(hits, hits + misses),
+        "contact_detected_precision": contact.precision(found, true),
+        "contact_detected_recall": contact.recall(found, true),
         "contact_detected_f1": contact.f1(counts.sum(0)),
         "contact_detected_near_precision": contact.precision(found[near], true[near]),
         "contact_detected_brier": float(np.mean((probability - true) ** 2)),
@@ -105,7 +99,7 @@ def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     figures["floor_mm"] = 1e3 * _mean(pooled(have, f"{key}planted_height"))
     figures["foot_swing_mm"] = 1e3 * _mean(pooled(have, f"{key}foot_swing"))
     lags = [lag for s in have if "truth/standing" in s.values for lag in _lift_lags(s, stage)]
-    figures["foot_lift_frames"] = _mean(np.abs(lags)) if lags else np.nan
+    figures["foot_lift_frames"] = over_known(np.mean, np.abs(lags))
     return finite(figures)
 
 
@@ -180,11 +174,5 @@ def _lift_lags(s: SequenceMetrics, stage: str) -> list[float]:
     ]
 
 
-def _share(part: float, whole: float) -> float:
-    return part / whole if whole else float("nan")
-
-
 def _mean(values: np.ndarray | None) -> float:
-    if values is None or not np.isfinite(values).any():
-        return float("nan")
-    return float(np.nanmean(values.astype(np.float64)))
+    return float("nan") if values is None else over_known(np.nanmean, values.astype(np.float64))

@@ -20,28 +20,28 @@ from bench.evaluate.part import (
 from bench.evaluate.through_wall import count_behind_wall
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.evaluation.physics.at_truth import displacements
 from intercap_core.evaluation.physics.figures import physics_figures
 from intercap_core.evaluation.verdict.figures import verdict_figures
 from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
-# Figures of the sequential fits that are repeated in the area ``joint``, and their names there
-SEQUENTIAL = {
-    "body_pve_mm": "body_pve_sequential_mm",
-    "hand_grasp_mpjpe_mm": "hand_grasp_sequential_mm",
-    "fingertip_touching_mm": "fingertip_touching_sequential_mm",
-    "slip_mm_s": "slip_sequential_mm_s",
-    "planted_mm_s": "planted_sequential_mm_s",
-    "floor_mm": "floor_sequential_mm",
-    "foot_swing_mm": "foot_swing_sequential_mm",
-    "acceleration_feet_mm": "acceleration_feet_sequential_mm",
-}
-# Second names of figures in the area ``joint``: area and name of the figure
+# Further names of figures in the area ``joint``: area and name of the figure
 ALSO = {
+    "body_pve_sequential_mm": ("body_fit", "body_pve_mm"),
+    "hand_grasp_sequential_mm": ("body_fit", "hand_grasp_mpjpe_mm"),
+    "fingertip_touching_sequential_mm": ("body_fit", "fingertip_touching_mm"),
+    "slip_sequential_mm_s": ("body_fit", "slip_mm_s"),
+    "planted_sequential_mm_s": ("body_fit", "planted_mm_s"),
+    "floor_sequential_mm": ("body_fit", "floor_mm"),
+    "foot_swing_sequential_mm": ("body_fit", "foot_swing_mm"),
+    "acceleration_feet_sequential_mm": ("body_fit", "acceleration_feet_mm"),
     "object_translation_median_mm": ("joint", "object_translation_mm"),
     "contact_vertex_f1": ("joint", "contact_f1"),
     "penetration_mean_mm": ("penetration", "mean_mm"),
+    "extrinsics_mm": ("extrinsics", "joint_mean_mm"),
+    "extrinsics_scene_mm": ("extrinsics", "after_mean_mm"),
 }
 Areas = dict[str, Figures]
 
@@ -78,23 +78,18 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     """All figures of a group of sequences by area: the stages, and areas common to all stages."""
     known = [s for s in sequences if s.has_truth]
     found = {
-        stage: figures.truth_figures(sequences, stage) | sequence_figures.hold_figures(known, stage)
+        stage: {
+            **figures.truth_figures(sequences, stage),
+            **sequence_figures.hold_figures(known, stage),
+            **{
+                f"contact_f1_at_{mm:g}mm": value
+                for mm, value in figures.contact_sweep(sequences, stage).items()
+            },
+        }
         for stage in ESTIMATES
     }
-    for stage in ESTIMATES:
-        sweep = figures.contact_sweep(sequences, stage)
-        found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
-    found["joint"] |= sequence_figures.stated_contact_figures(known) | _extra_joint_figures(
-        known, found
-    )
-    penetration = figures.penetration_figures(sequences)
-    for name, (area, measure) in ALSO.items():
-        figure = {**found, "penetration": penetration}[area].get(measure)
-        if figure is not None:
-            found["joint"][name] = figure
-    return {
-        **found,
-        "penetration": penetration,
+    found |= {
+        "penetration": figures.penetration_figures(sequences),
         "vertex_to_cloud": figures.cloud_figures(sequences),
         "vertex_to_cloud_floor": figures.floor_figures(sequences),
         "extrinsics": figures.extrinsics_figures(sequences),
@@ -102,32 +97,28 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
         "verdict": verdict_figures(known) | figures.bad_frame_figures(known),
         "physics": physics_figures(sequences),
     }
+    also = {name: found[area].get(key) for name, (area, key) in ALSO.items()}
+    found["joint"] |= sequence_figures.stated_contact_figures(known) | _figures_by_object(known)
+    found["joint"] |= {name: value for name, value in also.items() if value is not None}
+    return found
 
 
-def _extra_joint_figures(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
-    """Further figures of the area ``joint``: those of the sequential fits, and by object."""
-    first = found["body_fit"]
-    extra = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
-    if any(s.object_ for s in sequences):
-        worse = sequence_figures.worse_objects(sequences)
-        extra |= {"object_worse_count": float(len(worse))}
-    cameras = figures.extrinsics_figures(sequences)
-    if "joint_mean_mm" in cameras:
-        extra["extrinsics_mm"] = cameras["joint_mean_mm"]
-        extra["extrinsics_scene_mm"] = cameras["after_mean_mm"]
+def _figures_by_object(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """Figures of the area ``joint`` that are computed for each object."""
+    found: Figures = {}
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
         slips = sequence_figures.slip_by_object(sequences, stage)
-        extra |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
+        found |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
     by_object = grouped([s for s in sequences if s.object_], "object_")
+    if by_object:
+        found["object_worse_count"] = float(len(sequence_figures.worse_objects(sequences)))
     for name, some in by_object.items():
         turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
         if turn is not None:
-            extra[f"{name}.object_rotation_p95_deg"] = turn
-    depths = [figures.penetration_figures(some) for some in by_object.values()]
-    deepest = [found["mean_mm"] for found in depths if np.isfinite(found.get("mean_mm", np.nan))]
-    if deepest:
-        extra["penetration_worst_object_mm"] = max(deepest)
-    return extra
+            found[f"{name}.object_rotation_p95_deg"] = turn
+    depths = [figures.penetration_figures(some).get("mean_mm") for some in by_object.values()]
+    worst = over_known(np.nanmax, np.array(depths, float))
+    return finite(found | {"penetration_worst_object_mm": worst})
 
 
 def flat_areas(sequences: Sequence[SequenceMetrics]) -> Figures:
@@ -155,12 +146,11 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
         found["contact.through_wall_share"] = float(behind / touched)
     moved = [e.displacement for e in every if not e.annotated]
     for stage in ("truth", "joint", "sequential"):
-        values = np.concatenate([np.zeros(0), *(some[stage] for some in moved if some)])
-        if len(values):
-            found[f"physics.displacement_{stage}_mm"] = 1e3 * float(values.mean())
+        values = [value for some in moved if some for value in some[stage]]
+        found[f"physics.displacement_{stage}_mm"] = 1e3 * over_known(np.mean, values)
     if "joint_annotated.contact_detected_f1" in found:
         found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
-    return found
+    return finite(found)
 
 
 PART = EvaluationPart(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.evaluation.known import finite, over_known
 from intercap_core.evaluation.truth import match_times
 from intercap_core.formats.detections.read import Detections, PeopleOfImages
 from intercap_core.formats.recordings.frames import Frames
@@ -36,12 +37,13 @@ class WindowErrors:
 
 def window_figures(recordings: Sequence[WindowErrors]) -> dict[str, float]:
     """Share of cameras in step that were moved, and of cut cameras that are silently wrong."""
-    found = {
-        "in_step_moved_share": [errors.moved for errors in recordings],
-        "starts_silent_share": [errors.silent for errors in recordings],
-    }
-    wrong = {key: np.concatenate([np.zeros(0, bool), *values]) for key, values in found.items()}
-    return {key: float(values.mean()) for key, values in wrong.items() if len(values)}
+    moved, silent = ([w for r in recordings for w in getattr(r, n)] for n in ("moved", "silent"))
+    return finite(
+        {
+            "in_step_moved_share": over_known(np.mean, moved),
+            "starts_silent_share": over_known(np.mean, silent),
+        }
+    )
 
 
 @dataclass(frozen=True, eq=False)

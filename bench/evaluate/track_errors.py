@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.evaluation import motion, object_pose
-from intercap_core.evaluation.figures import Figures
+from intercap_core.evaluation.known import Figures
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.evaluation.tracks import read_object
 from intercap_core.evaluation.truth import match_times, object_errors

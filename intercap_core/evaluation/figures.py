@@ -17,6 +17,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation import contact, object_errors
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.flags import PARTS, Flags
 from intercap_core.schemas import BAD_BODY_M, CONTACT_M, METRICS, PER_VERTEX_METRICS
@@ -31,8 +32,6 @@ SUMMARY_PENETRATION = (
     "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
 )  # fmt: skip
 _PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
-
-Figures = dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +100,6 @@ def pooled_flags(sequences: Sequence[SequenceMetrics]) -> Flags:
     """Flags of all frames of one or more sequences."""
     flagged = np.concatenate([s.flags.flagged for s in sequences])
     return Flags(flagged, [reason for s in sequences for reason in s.flags.reasons])
-
-
-def finite(figures: Figures) -> Figures:
-    """The figures that are known."""
-    return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
 def finite_median(values: np.ndarray) -> float:
@@ -247,9 +241,7 @@ def _over(
 ) -> float:
     """Apply ``how`` to dataset ``key`` over all frames; NaN if it is unknown everywhere."""
     values = pooled(sequences, key)
-    if values is None or not np.isfinite(values).any():
-        return float("nan")
-    return float(how(values.astype(np.float64)))
+    return float("nan") if values is None else over_known(how, values.astype(np.float64))
 
 
 def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
@@ -259,8 +251,8 @@ def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
     touching = pooled(handling, "truth/contact_region")
     if errors is None or touching is None:
         return float("nan")
-    chosen = errors[touching[:, :2]]  # METRIC_REGIONS starts with the left and the right hand
-    return 1e3 * float(chosen.mean()) if len(chosen) else float("nan")
+    # METRIC_REGIONS starts with the left and the right hand
+    return 1e3 * over_known(np.mean, errors[touching[:, :2]])
 
 
 def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:

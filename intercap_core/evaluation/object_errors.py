@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.evaluation import motion, object_pose
+from intercap_core.evaluation import contact, motion, object_pose
+from intercap_core.evaluation.known import Figures, over_known
 from intercap_core.geometry.solve.time_series import runs
-
-Figures = dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,65 +68,53 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
     """
     if not recordings:
         return {}
-    seen = np.concatenate([r.views >= 2 for r in recordings])
-    lost = np.concatenate([r.lost for r in recordings])
-    flagged = np.concatenate([r.flagged for r in recordings])
+    seen = _pooled(recordings, "views") >= 2
+    lost, flagged = (_pooled(recordings, name) for name in ("lost", "flagged"))
+    first = [object_pose.first_seen_found(r.translation, r.rotation, r.views) for r in recordings]
+    ended = [last + 1 < len(r.lost) for r in recordings for _, last in runs(r.lost)]
     found: Figures = {
         "lost_share": float(lost.mean()),
         "lost_unnoticed_share": float((lost & ~flagged).mean()),
         "flagged_share": float(flagged.mean()),
-    }
-    if flagged.any():
-        found["flag_precision"] = float((lost & flagged).sum() / flagged.sum())
-    for key, unit, scale, errors in (
-        ("translation", "mm", 1e3, [r.translation for r in recordings]),
-        ("rotation", "deg", 1.0, [r.rotation for r in recordings]),
-    ):
-        values = scale * np.concatenate(errors)[seen]
-        if len(values):
-            found[f"{key}_median_{unit}"] = float(np.median(values))
-            with np.errstate(invalid="ignore"):  # errors are infinite if the object was never found
-                found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
-    add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
-    if len(add):
-        found["add_s_recall"] = float((add < 0.1).mean())  # the usual threshold
+        "flag_precision": contact.precision(flagged, lost),
+        "add_s_recall": over_known(np.mean, _pooled(recordings, "add_s") < 0.1),  # usual threshold
         # recall averaged over the thresholds of the BOP challenge 2019
-        found["mssd_recall"] = float((worst[:, None] < np.arange(1, 11) * 0.05).mean())
-    for name, errors_ in (
-        ("normalised_median", [r.normalised for r in recordings]),
-        ("normalised_turn_median", [r.normalised_turn for r in recordings]),
-    ):
-        ratios = _pooled(errors_)
-        if np.isfinite(ratios).any():
-            found[name] = float(np.nanmedian(ratios))
-    first = [object_pose.first_seen_found(r.translation, r.rotation, r.views) for r in recordings]
-    counted = [f for f in first if f is not None]
-    if counted:
-        found["first_frame_success"] = float(np.mean(counted))
-    ended = [last + 1 < len(r.lost) for r in recordings for _, last in runs(r.lost)]
-    if ended:
-        found["recovered_share"] = float(np.mean(ended))
-    return found | _jitter_and_lag(recordings)
+        "mssd_recall": over_known(
+            np.mean, _pooled(recordings, "mssd")[:, None] < np.arange(1, 11) * 0.05
+        ),
+        "first_frame_success": over_known(np.mean, [f for f in first if f is not None]),
+        "recovered_share": over_known(np.mean, ended),
+    }
+    for key, unit, scale in (("translation", "mm", 1e3), ("rotation", "deg", 1.0)):
+        values = scale * _pooled(recordings, key)[seen]
+        found[f"{key}_median_{unit}"] = over_known(np.median, values)
+        with np.errstate(invalid="ignore"):  # errors are infinite if the object was never found
+            found[f"{key}_p95_{unit}"] = over_known(np.percentile, values, 95)
+    for key in ("normalised", "normalised_turn"):
+        ratios = _pooled(recordings, key).astype(np.float64)
+        found[f"{key}_median"] = over_known(np.nanmedian, ratios)
+    found |= _jitter_and_lag(recordings)
+    return {key: value for key, value in found.items() if not np.isnan(value)}
 
 
-def _pooled(parts: Sequence[np.ndarray | None]) -> np.ndarray:
-    return np.concatenate([np.zeros(0), *(part for part in parts if part is not None)])
+def _pooled(recordings: Sequence[ObjectErrors], name: str) -> np.ndarray:
+    """Values of the recordings that have them."""
+    parts = [part for r in recordings if (part := getattr(r, name)) is not None]
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def _jitter_and_lag(recordings: Sequence[ObjectErrors]) -> Figures:
     """Jitter over all frames at rest, and delay of the track at the onset of motion."""
-    found: Figures = {}
     steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []
     for r in recordings:
         resting = motion.resting_steps(r.moves)
         steps.append(motion.steps(r.centre, r.true_centre)[resting])
         turns.append(r.turn[1:][resting])
         lags += motion.motion_onset_lags(r.centre, r.true_centre, r.moves, r.fps)
-    for unit, values, scale in (("mm", steps, 1e3), ("deg", turns, 1.0)):
-        pooled = np.concatenate(values).astype(np.float64)
-        if len(pooled):
-            found[f"rest_jitter_{unit}"] = scale * float(np.sqrt((pooled**2).mean()))
-    if lags:
-        found["motion_onset_frames"] = float(np.abs(lags).mean())
-        found["motion_onset_late_frames"] = float(np.mean(lags))
-    return found
+    squares = [over_known(np.mean, np.concatenate(values) ** 2) for values in (steps, turns)]
+    return {
+        "rest_jitter_mm": 1e3 * float(np.sqrt(squares[0])),
+        "rest_jitter_deg": float(np.sqrt(squares[1])),
+        "motion_onset_frames": over_known(np.mean, np.abs(lags)),
+        "motion_onset_late_frames": over_known(np.mean, lags),
+    }

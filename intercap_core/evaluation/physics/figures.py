@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.evaluation.figures import Figures, SequenceMetrics, pooled
+from intercap_core.evaluation.figures import SequenceMetrics, pooled
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.evaluation.physics.carriers import Carrier
 
 
@@ -37,12 +38,15 @@ def physics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
         for key in ("release_displacement", "penetration", "bad")
     )
     assert moved is not None and depth is not None and bad is not None
-    result: Figures = {"releases": float(len(moved)), **shares, "bad_share": float(bad.mean())}
-    if len(moved):
-        result["displacement_mm"] = 1e3 * float(moved.mean())
-        result["displacement_p95_mm"] = 1e3 * float(np.percentile(moved, 95))
     depth = depth[np.isfinite(depth)]
-    if len(depth):
-        result["penetration_mm"] = 1e3 * float(depth.mean())
-        result["penetration_p98_mm"] = 1e3 * float(np.percentile(depth, 98))
-    return result
+    return finite(
+        {
+            "releases": float(len(moved)),
+            **shares,
+            "bad_share": float(bad.mean()),
+            "displacement_mm": 1e3 * over_known(np.mean, moved),
+            "displacement_p95_mm": 1e3 * over_known(np.percentile, moved, 95),
+            "penetration_mm": 1e3 * over_known(np.mean, depth),
+            "penetration_p98_mm": 1e3 * over_known(np.percentile, depth, 98),
+        }
+    )

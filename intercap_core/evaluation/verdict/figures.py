@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from weakref import WeakKeyDictionary
+from functools import lru_cache
 
 import numpy as np
 
 from intercap_core.evaluation import figures
-from intercap_core.evaluation.figures import Figures, SequenceMetrics, finite_median
+from intercap_core.evaluation.figures import SequenceMetrics, finite_median
+from intercap_core.evaluation.known import Figures, finite, over_known
 
 
 @dataclass(frozen=True)
@@ -117,19 +118,10 @@ class StatedError:
         return self.stated / self.factor <= self.true <= self.stated * self.factor
 
 
+# Tables, figures and pages each need the stated errors, whose comparison with truth takes long.
+@lru_cache(maxsize=256)
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
     """Stated errors of every part; empty if the metrics have no verdict."""
-    if sequence not in _stated_cache:
-        _stated_cache[sequence] = _stated(sequence)
-    return _stated_cache[sequence]
-
-
-# Tables, figures and pages each need the stated errors, whose comparison with truth takes long.
-_stated_cache: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = WeakKeyDictionary()
-
-
-def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
-    """Stated errors of every part, without the cache."""
     values = sequence.values
     if "verdict/error" not in values:
         return ()
@@ -219,14 +211,16 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
             rank = float(spearmanr([e.stated for e in own], [e.true for e in own]).statistic)
             result[f"rank_correlation_{part}"] = rank
             ranks.append(rank)
-    if ranks:
-        result["rank_correlation"] = float(np.mean(ranks))
     stated, true = (np.array([getattr(e, name) for e in stating]) for name in ("stated", "true"))
     ratio = np.maximum(stated / true, true / stated)
-    result["within_factor_share"] = float((ratio < WITHIN).mean())
     bad_mm = 20.0
     bad = true > bad_mm
     if bad.any():
-        result["bad_sequence_recall"] = float((stated[bad] > bad_mm).mean())
         result["bad_sequences"] = float(bad.sum())
-    return result
+    return result | finite(
+        {
+            "rank_correlation": over_known(np.mean, ranks),
+            "within_factor_share": float((ratio < WITHIN).mean()),
+            "bad_sequence_recall": over_known(np.mean, stated[bad] > bad_mm),
+        }
+    )
