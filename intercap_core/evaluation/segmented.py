@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.evaluation.proximity import DEEPEST_M
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.geometry.camera.masks import Runs
-from intercap_core.geometry.camera.projection import MIN_DEPTH_M
-from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.transforms import apply
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 
 
@@ -39,29 +38,39 @@ def segmented_points(
     lens = camera.depth
     if lens is None:
         return points
-    least, most = _extent(
-        np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
-    )
-    if not np.isfinite(least[2]):  # the camera sees none of the points
+    local = apply(camera.depth_from_master, np.asarray(near, np.float64))
+    local = local[lens.inside_model(local)]
+    if not len(local):  # the camera sees none of the points
         return points
-    margin = lens.fx * DEEPEST_M / max(float(least[2]), DEEPEST_M)
-    low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
+    pixels, (nearest, farthest) = lens.project(local), (local[:, 2].min(), local[:, 2].max())
+    margin = lens.fx * DEEPEST_M / max(nearest, DEEPEST_M)
+    low, high = np.floor(pixels.min(0) - margin), np.ceil(pixels.max(0) + margin)
     for place, runs in enumerate(masks):
         window = None if runs is None else mask_window(depth, camera, runs)
         if runs is None or window is None:
             continue
-        points[place] = _placed(
-            depth,
-            mask_pixels(depth, camera, runs, window),
-            lens.rays,
-            (int(low[0]), int(low[1])),
-            (int(high[0]), int(high[1])),
-            1e3 * max(float(least[2]) - DEEPEST_M, 0.0),
-            1e3 * (float(most[2]) + DEEPEST_M),
-            camera.master_from_depth.astype(np.float32),
-            np.float32(bias_m),
-        )
+        index = mask_pixels(depth, camera, runs, window)
+        row, column = np.divmod(index, depth.shape[1])
+        around = (low[0] <= column) & (column <= high[0]) & (low[1] <= row) & (row <= high[1])
+        index = index[around]
+        z = depth.ravel()[index]
+        near_enough = (z > 1e3 * max(nearest - DEEPEST_M, 0.0)) & (z < 1e3 * (farthest + DEEPEST_M))
+        points[place] = _placed(camera, lens, index[near_enough], z[near_enough], bias_m)
     return points
+
+
+def _placed(
+    camera: Camera, lens: Intrinsics, index: np.ndarray, depth: np.ndarray, bias_m: float
+) -> np.ndarray:
+    """Points (N, 3) float32, master frame, of flat pixels ``index`` (M,) with ``depth`` (M,) mm.
+
+    Pixels whose ray is unknown have none.
+    """
+    z = depth * np.float32(1e-3)
+    z *= 1 - np.float32(bias_m) / z
+    x, y = (lens.rays.reshape(-1, 2)[index] * z[:, None]).T
+    pose = camera.master_from_depth[:3].astype(np.float32)
+    return np.stack([a * x + b * y + c * z + d for a, b, c, d in pose], 1)[np.isfinite(x)]
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:
@@ -146,68 +155,3 @@ def read_clouds(
         for t in range(total)
     ]
     return SegmentedClouds(images, rig, read_person_masks(person), candidates, depth_bias)
-
-
-@numba.njit(cache=True, nogil=True)
-def _extent(points, pose, lens):
-    """Range (2,3) of the projected points: minimum and maximum of column, row and depth (metres).
-
-    Points behind the camera or outside the lens calibration are ignored; without others the minimum
-    is infinite. All arrays are float64.
-
-    Args:
-        points: (M,3).
-        pose: (4,4) camera_from_points.
-        lens: (13,) lens parameters; the last one is the largest calibrated radius at z = 1.
-    """
-    found = np.empty((2, 3))
-    found[0], found[1] = np.inf, -np.inf
-    limit = lens[12]
-    place = np.empty(3)
-    for point in points:
-        for k in range(3):
-            place[k] = pose[k, 3]
-            for m in range(3):
-                place[k] += pose[k, m] * point[m]
-        x, y, z = place
-        if not (z > MIN_DEPTH_M and x * x + y * y <= (limit * z) ** 2):
-            continue
-        u, v = project_point(x, y, z, lens)
-        for k, value in enumerate((u, v, z)):
-            found[0, k], found[1, k] = min(found[0, k], value), max(found[1, k], value)
-    return found
-
-
-@numba.njit(cache=True, nogil=True)
-def _placed(depth, index, rays, low, high, nearest, farthest, pose, bias):
-    """Points (N,3) float32 of the pixels within a window and a range of depths.
-
-    Args:
-        depth: (H,W) uint16, millimetres.
-        index: (M,) flat pixel indices.
-        rays: (H,W,2) ray directions; pixels without a finite ray are skipped.
-        low, high: first column and row, and column and row after the last.
-        nearest, farthest: range of depths, exclusive, millimetres.
-        pose: (4,4) float32, points_from_camera.
-        bias: metres, subtracted from the depth along the ray.
-    """
-    width = depth.shape[1]
-    points = np.empty((len(index), 3), np.float32)
-    count = 0
-    for flat in index:
-        row, column = flat // width, flat % width
-        if not (low[0] <= column < high[0] and low[1] <= row < high[1]):
-            continue
-        measured = depth[row, column]
-        if not nearest < measured < farthest:
-            continue
-        across, down = rays[row, column]
-        if not np.isfinite(across):
-            continue
-        z = np.float32(measured) * np.float32(1e-3)
-        z *= np.float32(1) - bias / z
-        x, y = across * z, down * z
-        for k in range(3):
-            points[count, k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
-        count += 1
-    return points[:count].copy()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from intercap_core.evaluation.proximity import DEEPEST_M
-from intercap_core.evaluation.segmented import _extent, segmented_points
+from intercap_core.evaluation.segmented import segmented_points
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 from intercap_core.geometry.camera.masks import Runs, encode
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -62,18 +62,3 @@ def test_points_are_those_of_the_plain_lookup_around_the_meshes(bias: float):
     expected = apply(camera.master_from_depth, expected)
     assert len(person) > 50
     np.testing.assert_allclose(person, expected, atol=2e-6)
-
-
-@pytest.mark.parametrize("number", [1, 3, 500])
-def test_extent_covers_the_points_within_the_image(number: int):
-    camera = RIG[2]
-    lens = camera.depth
-    points = np.random.default_rng(number).uniform(-3, 3, (number, 3))
-    least, most = _extent(points, camera.depth_from_master, tuple(lens.parameters.tolist()))
-    local = apply(camera.depth_from_master, points)
-    local = local[lens.inside_model(local)]
-    if not len(local):
-        assert np.isinf(least).all()
-        return
-    seen = np.column_stack([lens.project(local), local[:, 2]])
-    np.testing.assert_allclose([least, most], [seen.min(0), seen.max(0)], rtol=1e-9)
