@@ -18,12 +18,11 @@ from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels
 from intercap_core.evaluation import body, contact
-from intercap_core.evaluation.figures import Figures, finite
+from intercap_core.evaluation.known import Figures, finite, over_known
 from intercap_core.evaluation.proximity import (
     DEEPEST_M,
     MeasuredCloud,
     seen_by_cameras,
-    visible_to_cloud,
 )
 from intercap_core.evaluation.segmented import SegmentedClouds, read_person_masks
 from intercap_core.evaluation.tracks import BodyTrack, read_body
@@ -120,7 +119,7 @@ class BodyClouds:
             to_mesh = self._tree.shaped(surface).distance(chosen, DEEPEST_M)
             points = self._samples.of(surface, self._faces)
             found[f"cloud_to_mesh{floor}"] = float(to_mesh.mean())
-            found[f"mesh_to_cloud_visible{floor}"] = visible_to_cloud(points, seen, cloud)
+            found[f"mesh_to_cloud_visible{floor}"] = cloud.mean_distance(points[seen])
         return found
 
     def _seen(self, t: int, true: np.ndarray, truth: Truth) -> np.ndarray:
@@ -252,38 +251,30 @@ def figures(recordings: Sequence[BodyErrors]) -> Figures:
     if not recordings:
         return {}
 
-    def mean(name: str) -> float:
-        values = np.concatenate([getattr(r, name).ravel() for r in recordings])
-        return 1e3 * float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+    def pooled(name: str) -> np.ndarray:
+        return np.concatenate([getattr(r, name) for r in recordings])
 
-    def median(name: str) -> float:
-        return float(np.nanmedian(np.concatenate([getattr(r, name).ravel() for r in recordings])))
-
-    pve, hands, touching = (
-        np.concatenate([getattr(r, name) for r in recordings])
-        for name in ("pve", "hands", "touching")
-    )
-    found: Figures = {
-        "frames": float(len(pve)),
-        "pve_mm": mean("pve"),
-        "pve_visible_mm": mean("visible"),
-        "mpjpe_mm": mean("joints"),
-        "hand_mpjpe_mm": mean("hands"),
-        "hand_wrist_mpjpe_mm": mean("hands_wrist"),
-        "face_mm": mean("face"),
-        "face_aligned_mm": mean("face_aligned"),
-        "acceleration_mm": mean("acceleration"),
-        "normalised_median": median("normalised"),
-        "normalised_hand_median": median("normalised_hands"),
+    means = {
+        "pve_mm": "pve",
+        "pve_visible_mm": "visible",
+        "mpjpe_mm": "joints",
+        "hand_mpjpe_mm": "hands",
+        "hand_wrist_mpjpe_mm": "hands_wrist",
+        "face_mm": "face",
+        "face_aligned_mm": "face_aligned",
+        "acceleration_mm": "acceleration",
     }
-    if np.isfinite(pve).any():
-        found["pve_p95_mm"] = 1e3 * float(np.nanpercentile(pve, 95))
-    if touching.any():
-        found["hand_grasp_mpjpe_mm"] = 1e3 * float(hands[touching].mean())
+    found: Figures = {
+        "frames": float(len(pooled("pve"))),
+        **{key: 1e3 * over_known(np.nanmean, pooled(name).ravel()) for key, name in means.items()},
+        "normalised_median": over_known(np.nanmedian, pooled("normalised")),
+        "normalised_hand_median": over_known(np.nanmedian, pooled("normalised_hands")),
+        "pve_p95_mm": 1e3 * over_known(np.nanpercentile, pooled("pve"), 95),
+        "hand_grasp_mpjpe_mm": 1e3 * over_known(np.mean, pooled("hands")[pooled("touching")]),
+    }
     for key in CLOUD_KEYS:
-        values = np.concatenate([np.zeros(0), *(r.clouds[key] for r in recordings if r.clouds)])
-        if np.isfinite(values).any():
-            found[f"{key}_mm"] = 1e3 * float(np.nanmean(values))
+        values = [value for r in recordings if r.clouds for value in r.clouds[key]]
+        found[f"{key}_mm"] = 1e3 * over_known(np.nanmean, values)
     return finite(found) | flag_figures(recordings)
 
 

@@ -20,8 +20,6 @@ from intercap_core.evaluation.proximity import (
     MeasuredCloud,
     PosedObject,
     seen_by_cameras,
-    vertex_to_cloud,
-    visible_to_cloud,
 )
 from intercap_core.evaluation.segmented import SegmentedClouds
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
@@ -259,8 +257,9 @@ class Measurement:
         chosen = person.points[::step].astype(np.float64)
         back = surface.distance(chosen)
         row: Values = {
-            "body_to_cloud": vertex_to_cloud(vertices, person),
-            "body_visible_to_cloud": visible_to_cloud(body_points, seen_body, person),
+            # of all vertices, also those that no camera sees, as in the paper
+            "body_to_cloud": person.mean_distance(vertices),
+            "body_visible_to_cloud": person.mean_distance(body_points[seen_body]),
             "cloud_to_body": float(back.mean()) if len(back) else np.nan,
         }
         if handled is not None:
@@ -268,8 +267,8 @@ class Measurement:
             if seen_object is None:
                 normals = handled.sample_normals @ handled.track.rotation[t].T
                 seen_object = seen_by_cameras(object_points, normals, self.rig.cameras, occluders)
-            row["object_to_cloud"] = vertex_to_cloud(object_vertices, object_)
-            row["object_visible_to_cloud"] = visible_to_cloud(object_points, seen_object, object_)
+            row["object_to_cloud"] = object_.mean_distance(object_vertices)
+            row["object_visible_to_cloud"] = object_.mean_distance(object_points[seen_object])
         return row, (person, object_)
 
     def _true_body(
@@ -279,10 +278,10 @@ class Measurement:
         if truth.vertices is None:
             return {}
         vertices = truth.vertices[t].astype(np.float64)
-        row: Values = {"truth/body_floor": vertex_to_cloud(vertices, person)}
+        row: Values = {"truth/body_floor": person.mean_distance(vertices)}
         if seen_body is not None:
             points = self.body_samples.of(vertices, self.faces)
-            row["truth/body_visible_floor"] = visible_to_cloud(points, seen_body, person)
+            row["truth/body_visible_floor"] = person.mean_distance(points[seen_body])
         return row
 
     def _true_object(
@@ -297,10 +296,10 @@ class Measurement:
         """Cloud distances of the true object, and true contact."""
         rotation, translation = truth.rotation[t], truth.translation[t]
         object_vertices = truth.object_vertices @ rotation.T + translation
-        row: Values = {"truth/object_floor": vertex_to_cloud(object_vertices, object_)}
+        row: Values = {"truth/object_floor": object_.mean_distance(object_vertices)}
         if seen_object is not None and sample_points is not None:
             points = sample_points @ rotation.T + translation
-            row["truth/object_visible_floor"] = visible_to_cloud(points, seen_object, object_)
+            row["truth/object_visible_floor"] = object_.mean_distance(points[seen_object])
         if truth.vertices is not None:
             vertices = truth.vertices[t].astype(np.float64)
             distance = surface.signed_distance(vertices, rotation, translation)

@@ -28,23 +28,9 @@ class MeasuredCloud:
             return np.full(len(points), np.nan)
         return self._tree.distance(points)
 
-
-def vertex_to_cloud(vertices: np.ndarray, cloud: MeasuredCloud) -> float:
-    """Mean distance of all vertices (V, 3) from the cloud, metres, as in the paper.
-
-    It includes occluded vertices, near which nothing was measured.
-    """
-    return float(cloud.distance(vertices).mean())
-
-
-def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredCloud) -> float:
-    """Mean distance of the visible surface samples from the cloud, metres; NaN if none is visible.
-
-    ``points``: (N, 3). ``visible``: (N,) bool.
-    """
-    if not visible.any():
-        return float("nan")
-    return float(cloud.distance(points[visible]).mean())
+    def mean_distance(self, points: np.ndarray) -> float:
+        """Mean :meth:`distance` of points (M, 3); NaN without points."""
+        return float(self.distance(points).mean()) if len(points) else float("nan")
 
 
 REACH_M = 0.10  # distances outside a surface are clipped here: no figure needs larger ones

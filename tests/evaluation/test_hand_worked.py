@@ -14,8 +14,6 @@ from intercap_core.evaluation.proximity import (
     MeasuredCloud,
     PosedObject,
     seen_by_cameras,
-    vertex_to_cloud,
-    visible_to_cloud,
 )
 from intercap_core.evaluation.scene_errors import displacement, rig_centre
 from intercap_core.flags import OF_OBJECT, PARTS, Flags
@@ -203,11 +201,11 @@ def test_turn_errors_are_relative_and_over_the_symmetry_group() -> None:
 
 def test_cloud_distances_count_all_or_only_visible_points() -> None:
     cloud = MeasuredCloud(np.array([[0.0, 0, 0.1], [1, 0, 0.3]]))
-    assert vertex_to_cloud(SQUARE[:2], cloud) == pytest.approx(0.2)
+    assert cloud.mean_distance(SQUARE[:2]) == pytest.approx(0.2)
     visible = np.array([True, False])
-    assert visible_to_cloud(SQUARE[:2], visible, cloud) == pytest.approx(0.1)
-    assert np.isnan(visible_to_cloud(SQUARE[:2], ~visible & visible, cloud))
-    assert np.isnan(vertex_to_cloud(SQUARE, MeasuredCloud(np.empty((0, 3)))))
+    assert cloud.mean_distance(SQUARE[:2][visible]) == pytest.approx(0.1)
+    assert np.isnan(cloud.mean_distance(SQUARE[:0]))
+    assert np.isnan(MeasuredCloud(np.empty((0, 3))).mean_distance(SQUARE))
 
 
 def test_samples_cover_area_not_vertices() -> None:
