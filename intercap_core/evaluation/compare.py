@@ -7,10 +7,9 @@ than 0.5 degrees. It has also changed if its contact regions or flag differ.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -94,19 +93,9 @@ def _figures(old: Path, new: Path) -> pd.DataFrame:
             summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return pd.DataFrame(columns=["figure", "old", "new"])
-        both.append(dict(_numbers(summary)))
-    before, after = both
-    rows = [(name, before[name], after[name]) for name in before if name in after]
-    return pd.DataFrame(rows, columns=["figure", "old", "new"])
-
-
-def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, float]]:
-    """Yield the numbers of nested mappings with their path, "outer.inner"."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{above}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield f"{above}{name}", float(value)
+        both.append(pd.json_normalize(summary).select_dtypes("number").loc[0].astype(float))
+    table = pd.concat(both, axis=1, join="inner", keys=["old", "new"])
+    return table.rename_axis("figure").reset_index()
 
 
 def _sequences(folder: Path) -> dict[str, Path]:

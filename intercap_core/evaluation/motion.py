@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
+from intercap_core.geometry.solve.time_series import runs
 
 
 def acceleration(positions: np.ndarray, fps: float) -> np.ndarray:
@@ -97,21 +98,14 @@ def motion_onset_lags(
         fps: frames per second.
     """
     lags: list[float] = []
-    start = 0
-    total = len(is_moving)
-    while start < total:
-        end = start
-        while end < total and is_moving[end] == is_moving[start]:
-            end += 1
-        rested = not is_moving[start] and end < total and end - start >= max(2, 0.2 * fps)
-        if rested:
-            over = end
-            while over < total and is_moving[over]:
-                over += 1
-            fitted, true = (_onset(path[start:over], end - start) for path in (centre, true_centre))
-            if true is not None:
-                lags.append(float((over - start if fitted is None else fitted) - true))
-        start = end
+    motions = {first: last + 1 for first, last in runs(is_moving)}
+    for start, last in runs(~is_moving):
+        rest, over = last + 1 - start, motions.get(last + 1)
+        if over is None or rest < max(2, 0.2 * fps):
+            continue
+        fitted, true = (_onset(path[start:over], rest) for path in (centre, true_centre))
+        if true is not None:
+            lags.append(float((over - start if fitted is None else fitted) - true))
     return lags
 
 

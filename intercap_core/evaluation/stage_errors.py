@@ -6,7 +6,6 @@ Datasets are named ``truth/<stage>/<key>`` for errors and ``truth/<key>`` for th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,18 +22,6 @@ from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import METRIC_REGIONS
 
 _FEET = ("left_foot", "right_foot")  # regions of the soles
-
-
-@dataclass(frozen=True, eq=False)
-class _ObjectSurfaces:
-    """Surfaces of the tracked and of the true object."""
-
-    mesh: ObjectMesh
-    """Mesh of the tracked object."""
-    surface: PosedObject
-    """Surface of the tracked object."""
-    true_surface: DistanceField
-    """Surface of the true object, which may have another mesh."""
 
 
 class StageErrors:
@@ -58,13 +45,12 @@ class StageErrors:
         self._true_distance, self._true_facing = true_distance, true_facing
         self._threshold, self._reach = threshold_m, contact.facing_reach(threshold_m)
         self._fps = fps
-        self._object: _ObjectSurfaces | None = None
-        if mesh is not None and truth.has_object:
-            self._object = _ObjectSurfaces(
-                mesh,
-                PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight),
-                DistanceField(truth.object_vertices, truth.object_faces),
+        self._mesh = mesh if truth.has_object else None
+        if self._mesh is not None:
+            self._surface = PosedObject(
+                self._mesh.vertices, self._mesh.faces, watertight=self._mesh.watertight
             )
+            self._true_surface = DistanceField(truth.object_vertices, truth.object_faces)
         self._touched = np.zeros(0, int)  # vertices in true contact in at least one frame
         self._true_local = np.zeros((0, 0, 3))  # (T, N, 3) of these vertices, true object's frame
         if truth.vertices is not None and true_facing is not None:
@@ -76,10 +62,10 @@ class StageErrors:
 
     def of_object(self, stage: str, track: ObjectTrack) -> Values:
         """Errors of the object's pose after ``stage``."""
-        if self._object is None:
+        if self._mesh is None:
             return {}
         true = self._truth.rotation, self._truth.translation
-        errors = truths.object_errors(*true, track, self._object.mesh, self._fps)
+        errors = truths.object_errors(*true, track, self._mesh, self._fps)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
     def of_body(
@@ -117,13 +103,13 @@ class StageErrors:
             skin.append(vertices[self._touched])
             soles.append([vertices[regions[foot]] for foot in _FEET])
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
-            if self._object is None or self._true_facing is None:
+            if self._mesh is None or self._true_facing is None:
                 continue
             distance = np.full(len(vertices), np.inf)  # the object was not found
             if known is not None:
                 distance = known[t]
             elif track.known and tree is not None:
-                distance = self._object.surface.contact_distance(
+                distance = self._surface.contact_distance(
                     BodySurface(vertices.astype(np.float64), faces, tree),
                     track.rotation[t],
                     track.translation[t],
@@ -147,12 +133,11 @@ class StageErrors:
 
     def _slip(self, skin: np.ndarray, track: ObjectTrack) -> Values:
         """Slip (T,) of the skin vertices (T, N, 3) that are ever in true contact."""
-        assert self._true_facing is not None and self._object is not None
+        assert self._true_facing is not None and self._mesh is not None
         if not track.known:
             return {"slip": np.full(len(skin), np.nan)}
         pose, true = (rigid(of.rotation, of.translation) for of in (track, self._truth))
-        true_surface = self._object.true_surface
-        symmetry = self._object.mesh.symmetry  # a rotation about a symmetry axis is no slip
+        symmetry = self._mesh.symmetry  # a rotation about a symmetry axis is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
         )
@@ -161,7 +146,7 @@ class StageErrors:
             _local(skin, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,
             touching,
-            lambda points: true_surface.closest(points).normals,
+            lambda points: self._true_surface.closest(points).normals,
             self._fps,
         )
         return {"slip": speed}
@@ -195,10 +180,10 @@ class StageErrors:
     def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
         """Datasets of the truth itself; ``regions`` are the body's vertex indices by region."""
         truth = self._truth
-        if self._object is None:
+        if self._mesh is None:
             return self._true_skin(regions)
         centre = object_pose.posed_point(
-            truth.rotation, truth.translation, self._object.mesh.centre_of_mass
+            truth.rotation, truth.translation, self._mesh.centre_of_mass
         )
         return {
             "truth/sweep": contact.SWEEP_M,
@@ -217,7 +202,7 @@ class StageErrors:
         soles, carrying = self._true_soles(regions)
         carried = [np.any(vertices, axis=1) for vertices in carrying]
         near = {}
-        if self._object is not None and self._true_distance is not None:
+        if self._mesh is not None and self._true_distance is not None:
             nearest = [self._true_distance[:, regions[name]].min(1) for name in METRIC_REGIONS]
             near = {"truth/region_distance": np.stack(nearest, 1)}
         return near | {

@@ -212,10 +212,8 @@ def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
     listed in ``left_out``.
     """
     body, body_frames = np.zeros(0), 0
+    objects: dict[str, tuple[np.ndarray, np.ndarray, int]] = {}  # samples, contact counts, frames
     left_out: dict[str, list[str]] = {}
-    counts: dict[str, np.ndarray] = {}
-    points: dict[str, np.ndarray] = {}
-    frames: dict[str, int] = {}
     for summary in summaries:
         contact, surface = summary.body_contact, summary.surface
         surface_contact = summary.surface_contact
@@ -232,24 +230,21 @@ def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
                 f"its body has {len(contact)} vertices, that of the first sequence {len(body)}: "
                 "excluded from the body's heatmap"
             )
-        if name not in counts:
-            counts[name], points[name] = np.zeros(len(surface_contact)), surface
-            frames[name] = 0
-        if not np.array_equal(points[name], surface):
+        points, touched, frames = objects.get(name, (surface, np.zeros(len(surface)), 0))
+        if np.array_equal(points, surface):
+            objects[name] = points, touched + surface_contact, frames + count
+        else:
             left_out.setdefault(summary.name, []).append(
                 f"object {name!r} was measured with another mesh than in the first sequence: "
                 "excluded from its heatmap; re-run stage 'metrics' of the sequences with the older "
                 "mesh"
             )
-            continue
-        counts[name] += surface_contact
-        frames[name] += count
     return Heatmaps(
         body / max(1, body_frames),
         body_frames,
         {
-            name: SurfaceHeat(points[name], counts[name] / frames[name], frames[name])
-            for name in sorted(counts)
+            name: SurfaceHeat(points, touched / frames, frames)
+            for name, (points, touched, frames) in sorted(objects.items())
         },
         left_out,
     )
