@@ -5,33 +5,29 @@
 
 Stages `joint` and `metrics` are computed for each variant in ``VARIANTS`` from the artefacts of a
 run of SETTINGS (default: those of `make evaluate-quick`, which must have run). Results that are up
-to date by their content are reused, so an interrupted run continues. Prints a table, writes its
-figures with keys ``<variant>.<measure>``, and the table as Markdown into the folder. No file of the
-project is overwritten.
+to date by their content are reused, so an interrupted run continues. Prints a table, and writes its
+figures with keys ``<variant>.<measure>``. No file of the project is overwritten.
+
+Accelerations are errors, mm a frame^2 at 30 fps; contact is F1; penetration is the joint fit's.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import track
 
-from bench.again import artefacts_of, check_run, compute_once, slug
-from bench.command import exit_on_user_error
+from bench.again import artefacts_of, check_run, compute_once, slug, variants_parser
+from bench.command import exit_on_user_error, replace_figures
+from bench.evaluate.part import number
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.config import JointSettings
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.joint.problem import TERMS
 from intercap_core.project import Project, load_project
 
-SETTINGS = Path("config/evaluation/quick.yaml")
 STAGES = ("joint", "metrics")  # what is computed for each variant
 SEQUENTIAL = "sequential only"
 # Settings of `joint` that differ from the project's, by the variant's name.
@@ -59,15 +55,21 @@ VARIANTS |= {
 }
 
 
-@dataclass(frozen=True)
-class Measure:
+class Measure(NamedTuple):
     """Column of the table."""
 
     title: str
     """Of the column."""
     name: str
     joint: str = "joint"
+    """Area of the figure after the joint fit."""
     sequential: str = "body_fit"
+    """Area of the figure of the sequential fits; "" = none."""
+
+    @property
+    def key(self) -> str:
+        """Key of the figure, without its variant."""
+        return self.name if self.joint == "joint" else f"{self.joint}_{self.name}"
 
 
 MEASURES = (
@@ -85,7 +87,6 @@ MEASURES = (
     Measure("penetration mm", "mean_mm", joint="penetration", sequential=""),
 )
 Figures = dict[str, float]
-Paths = dict[str, dict[str, dict[str, Path]]]  # by variant, sequence and stage
 
 
 def ablate(
@@ -101,25 +102,14 @@ def ablate(
     projects = {  # all before the first is computed, so that invalid settings fail at once
         variant: load_project(settings, {"joint": VARIANTS[variant]}) for variant in variants
     }
-    paths: Paths = {}
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        console=Console(stderr=True),
-    )  # fmt: skip
-    with bar as progress:
-        task = progress.add_task("", total=len(variants) * len(names))
-        for variant in variants:
-            paths[variant] = {}
-            for name in names:
-                progress.update(task, description=f"{variant}: {name}")
-                begin = time.perf_counter()
-                paths[variant][name] = _fit(projects[variant], name, folder / slug(variant))
-                seconds = time.perf_counter() - begin
-                progress.console.print(f"{variant}: {name}, {seconds:.0f} s", highlight=False)
-                progress.advance(task)
+    found: dict[str, list[SequenceMetrics]] = {variant: [] for variant in variants}
+    jobs = [(variant, name) for variant in variants for name in names]
+    for variant, name in track(jobs, "variants"):
+        paths = _fit(projects[variant], name, folder / slug(variant))
+        found[variant].append(SequenceMetrics.read(paths["metrics"]))
     return {
-        **{variant: _figures(found, sequential=False) for variant, found in paths.items()},
-        SEQUENTIAL: _figures(next(iter(paths.values())), sequential=True),
+        **{variant: _figures(metrics, sequential=False) for variant, metrics in found.items()},
+        SEQUENTIAL: _figures(next(iter(found.values())), sequential=True),
     }
 
 
@@ -132,79 +122,39 @@ def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:
     return paths
 
 
-def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Figures:
+def _figures(metrics: Sequence[SequenceMetrics], *, sequential: bool) -> Figures:
     from bench.evaluate.sequences import areas
 
-    found = areas([SequenceMetrics.read(by_stage["metrics"]) for by_stage in paths.values()])
+    found = areas(metrics)
     return {
-        measure.name if measure.joint == "joint" else f"{measure.joint}_{measure.name}": value
+        measure.key: value
         for measure in MEASURES
         if (area := measure.sequential if sequential else measure.joint)
         and (value := found[area].get(measure.name)) is not None
     }
 
 
-def rows(figures: Mapping[str, Figures]) -> list[list[str]]:
-    """Cells of the table, one row per variant, "–" where a figure is unknown."""
-    keys = [m.name if m.joint == "joint" else f"{m.joint}_{m.name}" for m in MEASURES]
-    return [
-        [variant, *(_number(found[key]) if key in found else "–" for key in keys)]
-        for variant, found in figures.items()
-    ]
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
-
-
-def markdown(figures: Mapping[str, Figures], settings: Path, sequences: Sequence[str]) -> str:
-    """A section for bench/RESULTS.md, without its heading's date and commit."""
-    titles = ["variant", *(measure.title for measure in MEASURES)]
-    lines = [
-        "## What each term of the joint fit is worth",
-        f"`python -m bench.ablation {settings}`, {', '.join(sequences)}. Accelerations are errors,",
-        "mm a frame^2 at 30 fps; contact is F1; penetration is the joint fit's:",
-        "",
-        f"| {' | '.join(titles)} |",
-        f"|{'---|' * len(titles)}",
-        *(f"| {' | '.join(row)} |" for row in rows(figures)),
-    ]
-    return "\n".join(lines) + "\n"
+def print_table(figures: Mapping[str, Figures]) -> None:
+    """Print one row per variant; cells of unknown figures are empty."""
+    table = ListTable("variant", *(measure.title for measure in MEASURES))
+    for variant, found in figures.items():
+        table.add_row(variant, *(number(found.get(measure.key), 2) for measure in MEASURES))
+    standard_console().print(table)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line, compute, and write table and figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
-    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="default: all of SETTINGS")
-    parser.add_argument(
-        "--variants", nargs="+", metavar="NAME", help=f"default: all, {', '.join(VARIANTS)}"
-    )
-    parser.add_argument("--output", type=Path, default=Path("results/ablation.json"))
-    parser.add_argument("--folder", type=Path, default=Path("results/ablation"))
-    options = parser.parse_args(arguments)
+    options = variants_parser(__doc__, VARIANTS, "ablation").parse_args(arguments)
     with exit_on_user_error():
-        names = options.sequences or list(load_project(options.settings).sequences)
-        variants = options.variants or list(VARIANTS)
-        figures = ablate(options.settings, names, variants, options.folder)
-    table = ListTable("variant", *(measure.title for measure in MEASURES))
-    for row in rows(figures):
-        table.add_row(*row)
-    console = standard_console()
-    console.print(table)
-    section = options.folder / "RESULTS.md"
-    section.write_text(markdown(figures, options.settings, names), encoding="utf-8")
+        figures = ablate(options.settings, options.sequences, options.variants, options.folder)
+    print_table(figures)
     flat = {
         f"{slug(variant)}.{key}": round(value, 4)
         for variant, found in figures.items()
         for key, value in found.items()
     }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(flat, indent=1) + "\n", encoding="utf-8")
-    for path in (options.output, section):
-        print(path)
+    replace_figures(options.output, flat, ("",))
+    print(options.output)
 
 
 if __name__ == "__main__":

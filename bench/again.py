@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from functools import cache
@@ -17,6 +18,32 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 def slug(variant: str) -> str:
     """A variant's name in keys and folders."""
     return variant.replace(" ", "_")
+
+
+def variants_parser(
+    description: str | None, variants: Collection[str], name: str
+) -> argparse.ArgumentParser:
+    """Command line of a script that computes ``variants`` of the stages of a run.
+
+    Args:
+        description: the script's documentation.
+        name: figures are written to ``results/<name>.json``, artefacts below ``results/<name>``.
+    """
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    quick = Path("config/evaluation/quick.yaml")
+    parser.add_argument("settings", type=Path, nargs="?", default=quick)
+    parser.add_argument(
+        "--sequences", nargs="+", default=(), metavar="NAME", help="default: all of SETTINGS"
+    )
+    parser.add_argument(
+        "--variants", nargs="+", default=tuple(variants), metavar="NAME",
+        help=f"default: all, {', '.join(variants)}",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, default=Path(f"results/{name}.json"))
+    parser.add_argument("--folder", type=Path, default=Path(f"results/{name}"))
+    return parser
 
 
 def check_run(

@@ -26,7 +26,6 @@ of the project is overwritten.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -44,15 +43,15 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from bench.again import artefacts_of, check_run, compute_once, slug
+from bench.again import artefacts_of, check_run, compute_once, slug, variants_parser
 from bench.command import exit_on_user_error, replace_figures
 from bench.evaluate.part import number
+from bench.evaluate.sequences import areas
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.geometry.rigid.contact_vertices import contact_list
@@ -173,7 +172,6 @@ def _write_mesh(
     return entry.model_copy(update={"mesh": output, "contact_vertices": listed})
 
 
-SETTINGS = Path("config/evaluation/quick.yaml")
 STAGES = ("object_track", "joint", "metrics")
 AS_IT_IS, TRUE_MESH, FREE, OPEN = "as it is", "true mesh", "starts at the truth", "open mesh"
 
@@ -229,7 +227,6 @@ _OWN = (
     "joint.open_mesh_",
     *(f"joint.{key}" for key in ("extrinsics_floor_mm", *FLOORS)),
 )
-WIDTH = 120  # columns of the tables, also where a file takes them
 Figures = dict[str, float]
 Found = dict[str, dict[str, SequenceMetrics]]  # by variant and sequence
 
@@ -238,9 +235,8 @@ def compute_variants(
     settings: Path,
     sequences: Sequence[str],
     folder: Path,
-    *,
-    variants: Sequence[str] = tuple(VARIANTS),
-    cores: int = 1,
+    variants: Sequence[str],
+    cores: int,
 ) -> Found:
     """Compute the variants, ``cores`` sequences at a time; returns their metrics.
 
@@ -250,12 +246,9 @@ def compute_variants(
     names = list(sequences or project.sequences)
     check_run(project, names, STAGES, variants, VARIANTS)
     given = (repeat(settings), names, repeat(folder), repeat(tuple(variants)))
-    if cores == 1 or len(names) == 1:
-        every = list(map(_compute_sequence, *given))
-    else:
-        context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
-        with ProcessPoolExecutor(min(cores, len(names)), mp_context=context) as pool:
-            every = list(pool.map(_compute_sequence, *given))
+    context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
+    with ProcessPoolExecutor(min(cores, len(names)), mp_context=context) as pool:
+        every = list(pool.map(_compute_sequence, *given))
     return {
         variant: {
             name: SequenceMetrics.read(paths[variant])
@@ -329,16 +322,9 @@ def by_object(found: Found) -> dict[str, dict[str, Figures]]:
 
 
 def _measured(sequences: Sequence[SequenceMetrics]) -> Figures:
-    joint = figures.truth_figures(sequences, "joint")
-    every = {
-        **joint,
-        "tracked_translation_mm": figures.object_figures(sequences, "object_track").get(
-            "object_translation_mm"
-        ),
-        "extrinsics_mm": figures.extrinsics_figures(sequences).get("joint_mean_mm"),
-        "extrinsics_scene_mm": figures.extrinsics_figures(sequences).get("after_mean_mm"),
-        "penetration_mean_mm": figures.penetration_figures(sequences).get("mean_mm"),
-    }
+    found = areas(sequences)
+    tracked = {f"tracked_{key}": value for key, value in found["object_track"].items()}
+    every = found["joint"] | tracked
     wanted = (*MEASURES.values(), "extrinsics_scene_mm")
     return {key: float(value) for key in wanted if (value := every.get(key)) is not None}
 
@@ -385,7 +371,7 @@ def flat(found: Found) -> Figures:
 
 
 def print_tables(found: Found) -> None:
-    """A table of all sequences and one of each object, and the joint stage's figures in words."""
+    """A table of all sequences and one of each object, and the figures of the joint stage."""
     console = standard_console()
     for title, variants in {"all": by_variant(found), **by_object(found)}.items():
         table = ListTable("put in", *MEASURES, title=title)
@@ -393,42 +379,19 @@ def print_tables(found: Found) -> None:
             cells = (number(some.get(key), 2) for key in MEASURES.values())
             table.add_row(variant, *cells)
         console.print(table)
-    bounds, given = joint_figures(found), by_variant(found).get(AS_IT_IS, {})
-    if {"extrinsics_mm", "extrinsics_scene_mm"} <= set(given) and "extrinsics_floor_mm" in bounds:
-        scene, joint, floor = (
-            given["extrinsics_scene_mm"], given["extrinsics_mm"], bounds["extrinsics_floor_mm"],
-        )  # fmt: skip
-        way = f": {(scene - joint) / (scene - floor):.0%} of the way" if scene > floor else ""
-        console.print(
-            f"cameras: {scene:.2f} mm after scene, {joint:.2f} after joint, floor {floor:.2f}{way}",
-            highlight=False,
-        )
-    for key, value in bounds.items():
+    for key, value in joint_figures(found).items():
         console.print(f"joint.{key} {value:.3f}", highlight=False)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line, compute, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
-    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="default: all of SETTINGS")
-    parser.add_argument(
-        "--variants", nargs="+", metavar="NAME", help=f"default: all, {', '.join(VARIANTS)}"
-    )
+    parser = variants_parser(__doc__, VARIANTS, "oracle")
     parser.add_argument("--cores", type=int, default=0, help="sequences at a time; 0: all cores")
-    parser.add_argument("--output", type=Path, default=Path("results/oracle.json"))
-    parser.add_argument("--folder", type=Path, default=Path("results/oracle"))
     options = parser.parse_args(arguments)
     with exit_on_user_error():
         cores = options.cores or len(os.sched_getaffinity(0))
         found = compute_variants(
-            options.settings,
-            options.sequences or (),
-            options.folder,
-            variants=options.variants or tuple(VARIANTS),
-            cores=cores,
+            options.settings, options.sequences, options.folder, options.variants, cores
         )
         print_tables(found)
         replace_figures(options.output, flat(found), _OWN)
