@@ -98,8 +98,11 @@ def _imports_of_kernels() -> dict[str, set[str]]:
     return imported
 
 
-def bound_constants(statement: ast.stmt) -> list[str]:
-    """Names in capitals that a statement binds to expressions of numbers."""
+def bound_constants(statement: ast.stmt, *, keys_too: bool = False) -> list[str]:
+    """Names in capitals that a statement binds to expressions of numbers.
+
+    Keys of dictionaries may be texts, unless ``keys_too``.
+    """
     if isinstance(statement, ast.AnnAssign):
         targets: list[ast.expr] = [statement.target]
     elif isinstance(statement, ast.Assign):
@@ -108,12 +111,9 @@ def bound_constants(statement: ast.stmt) -> list[str]:
         return []
     if statement.value is None:
         return []
-    keys = [key for n in ast.walk(statement.value) if isinstance(n, ast.Dict) for key in n.keys]
-    literals = [
-        node.value
-        for node in ast.walk(statement.value)
-        if isinstance(node, ast.Constant) and node not in keys
-    ]
+    nodes = list(ast.walk(statement.value))
+    keys = [] if keys_too else [key for n in nodes if isinstance(n, ast.Dict) for key in n.keys]
+    literals = [n.value for n in nodes if isinstance(n, ast.Constant) and n not in keys]
     if not literals or not all(type(value) in (int, float) for value in literals):
         return []
     names = [n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]

@@ -3,16 +3,13 @@
     python -m bench.replay
 
 Started by :mod:`bench.sensitivity`. Reads the JSON of a :class:`Task` and the path of an output
-file from each line of the standard input, writes the task's :class:`Outcome` and prints the exit
-status. Each task runs in a fork of this process, because a changed constant must be imported before
-the modules that use it. The fork has the libraries already, whose import takes seconds, and no
-module of the package that has constants.
+file from the standard input, and writes the task's :class:`Outcome`. Each task needs a process of
+its own, because a changed constant must be imported before the modules that use it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import os
 import sys
@@ -27,11 +24,6 @@ from bench.changed_constant import Constant, import_changed, scaled
 from intercap_core.errors import UserError
 from intercap_core.kernel_cache import VARIABLE, use_kernel_cache
 
-# Libraries that most stages import
-LIBRARIES = (
-    *("numba", "torch", "cv2", "h5py", "pandas", "pydantic", "trimesh", "scipy.ndimage"),
-    *("scipy.optimize", "scipy.sparse.csgraph", "scipy.spatial.transform", "scipy.stats"),
-)
 # Of segmentation, the figures are those of the object's track without a detector's candidates
 IMAGES_ONLY = {"person": {"segmentation": "images"}}
 
@@ -137,25 +129,13 @@ def _text(value: Any) -> str:
 
 
 def main() -> None:
-    """Replay the tasks of the standard input."""
-    for name in LIBRARIES:
-        importlib.import_module(name)
-    for line in sys.stdin:
-        request = json.loads(line)
-        child = os.fork()
-        if child == 0:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            _write_outcome(**request)
-            os._exit(0)
-        _, status = os.waitpid(child, 0)
-        print(os.waitstatus_to_exitcode(status), flush=True)
-
-
-def _write_outcome(task: dict[str, Any], output: str, stale: list[str]) -> None:
+    """Replay the task of the standard input."""
+    request = json.load(sys.stdin)
+    task, output = request["task"], Path(request["output"])
     constant = task.pop("constant")
-    _use_kernels_without(stale, Path(output).parent)
+    _use_kernels_without(request["stale"], output.parent)
     outcome = replay(Task(**task, constant=Constant(**constant) if constant else None))
-    Path(output).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
+    output.write_text(json.dumps(asdict(outcome)), encoding="utf-8")
 
 
 def _use_kernels_without(stale: list[str], folder: Path) -> None:

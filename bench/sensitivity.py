@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
-from queue import Queue
 from threading import Lock
 
 from bench.again import check_run, content_of
@@ -68,9 +67,6 @@ class Replays:
     def __init__(self, path: Path, jobs: int) -> None:
         self._path, self._jobs, self._lock = path, jobs, Lock()
         self._known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        self._servers: Queue[subprocess.Popen[str]] = Queue()
-        for _ in range(jobs):
-            self._servers.put(_start_server())
         self._contents: dict[str, str] = {}
 
     def run(self, tasks: Sequence[Task]) -> list[Outcome]:
@@ -92,7 +88,7 @@ class Replays:
 
     def _outcome(self, task: Task, key: str) -> Outcome:
         if key not in self._known:
-            outcome = self._start(task)
+            outcome = _replayed(task)
             if outcome.failure and task.constant is None:
                 return outcome  # not stored: the fault is not that of a value
             with self._lock:
@@ -103,29 +99,22 @@ class Replays:
             print(f"{name} times {task.factor:g}: {outcome.seconds:.0f} s", file=sys.stderr)
         return Outcome(**self._known[key])
 
-    def _start(self, task: Task) -> Outcome:
-        stale = kernels_with(task.constant.module) if task.constant is not None else []
-        with tempfile.TemporaryDirectory() as folder:
-            output = Path(folder) / "outcome.json"
-            request = {"task": asdict(task), "output": str(output), "stale": stale}
-            server = self._servers.get()
-            assert server.stdin is not None and server.stdout is not None
-            server.stdin.write(json.dumps(request) + "\n")
-            server.stdin.flush()
-            status = server.stdout.readline().strip()
-            self._servers.put(server)
-            if status != "0":
-                return Outcome("", "", "", {}, 0.0, f"the process ended with status {status}")
-            return Outcome(**json.loads(output.read_text(encoding="utf-8")))
 
-
-def _start_server() -> subprocess.Popen[str]:
-    """A process that replays the tasks that it is sent, one after another, on one thread."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "bench.replay"],
-        env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    )  # fmt: skip
+def _replayed(task: Task) -> Outcome:
+    """Replay a task in a process of its own, on one thread."""
+    stale = kernels_with(task.constant.module) if task.constant is not None else []
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "outcome.json"
+        request = {"task": asdict(task), "output": str(output), "stale": stale}
+        done = subprocess.run(
+            [sys.executable, "-m", "bench.replay"], input=json.dumps(request), text=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        if done.returncode:
+            reason = f"the process ended with status {done.returncode}"
+            return Outcome("", "", "", {}, 0.0, reason)
+        return Outcome(**json.loads(output.read_text(encoding="utf-8")))
 
 
 def changes(unchanged: Outcome, other: Outcome) -> dict[str, tuple[float, float, float]]:

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from bench.evaluate import capture_errors, track_errors
+from bench.evaluate import capture_errors
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
-from intercap_core.evaluation import body, contact, object_errors
-from intercap_core.evaluation import truth as truths
-from intercap_core.evaluation.proximity import BodySurface, PosedObject
+from intercap_core.evaluation.figures import SequenceMetrics, truth_figures
+from intercap_core.evaluation.known import Figures
 from intercap_core.evaluation.tracks import read_body, read_object
-from intercap_core.evaluation.truth import Truth
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.evaluation.truth import match_times
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
-from intercap_core.schemas import CONTACT_M, METRIC_REGIONS, PERSON, SCENE
+from intercap_core.schemas import PERSON, SCENE, TRUTH
 
-Figures = dict[str, float]
 # Keypoints that lie in a joint of the same name; those of the skin have no true joint.
-JOINT_KEYPOINTS = tuple(k for k, name in enumerate(KEYPOINT_NAMES[BODY]) if name in JOINT_INDEX)
-SIDED = tuple(k for k in JOINT_KEYPOINTS if KEYPOINT_NAMES[k].startswith(("left_", "right_")))
+JOINT_KEYPOINTS = [k for k, name in enumerate(KEYPOINT_NAMES[BODY]) if name in JOINT_INDEX]
+JOINTS = [JOINT_INDEX[KEYPOINT_NAMES[k]] for k in JOINT_KEYPOINTS]
+SIDED = [k for k in JOINT_KEYPOINTS if KEYPOINT_NAMES[k].startswith(("left_", "right_"))]
+OWN_SIDE = [JOINT_INDEX[KEYPOINT_NAMES[k]] for k in SIDED]
+OTHER_SIDE = [
+    JOINT_INDEX["_".join(["right" if side == "left" else "left", part])]
+    for side, _, part in (KEYPOINT_NAMES[k].partition("_") for k in SIDED)
+]
 FLAGS = "flagged"
 CAPTURE_FIGURES = {
     "extrinsics_after_mm": "extrinsics mm",
@@ -35,12 +38,17 @@ CAPTURE_FIGURES = {
     "slips_false": "slips false",
     "ground_error_mm": "floor mm",
 }
-OBJECT_FIGURES = {
-    "translation_median_mm": "object mm",
-    "translation_p95_mm": "object p95 mm",
-    "rotation_median_deg": "object deg",
-    "rotation_p95_deg": "object p95 deg",
+# Figures of stage `metrics`
+FIT_FIGURES = {
+    "body_mpjpe_mm": "MPJPE mm",
+    "hand_mpjpe_mm": "hands mm",
+    "body_pve_mm": "PVE mm",
+    "object_translation_mm": "object mm",
+    "object_translation_p95_mm": "object p95 mm",
+    "object_rotation_deg": "object deg",
+    "object_rotation_p95_deg": "object p95 deg",
     "lost_share": "object lost",
+    "contact_region_f1": "contact F1",
 }
 
 
@@ -58,30 +66,16 @@ class Written:
         assert path is not None
         return path
 
-    @property
-    def mesh(self) -> ObjectMesh:
-        return ObjectMesh.load(self.project.objects[self.project.sequences[self.sequence].object])
-
-    @property
-    def gender(self) -> str:
-        return self.project.subjects[self.project.sequences[self.sequence].subject].gender
-
-    def true(self, num_vertices: int = 0) -> Truth:
-        """The truth at the times of the sequence's frame sets."""
-        with artefacts.read(self.artefacts["scene"], SCENE) as scene:
-            times, fps = scene["times"], float(scene.attributes["fps"])
-        return Truth.load(self.truth, times, fps, num_vertices)
-
 
 def figures_of(stage: str, written: Sequence[Written]) -> Figures:
     """Figures of a stage's artefacts over several sequences; ``flagged`` counts frames.
 
     Raises KeyError for a stage without figures.
     """
-    return _OF_STAGE[stage](written)
+    return _OF_STAGE[stage](stage, written)
 
 
-def _scene(written: Sequence[Written]) -> Figures:
+def _scene(_: str, written: Sequence[Written]) -> Figures:
     """Figures of the scene; flags are weak camera pairs and cameras with a note."""
     errors = [
         capture_errors.measure(w.artefacts["frames"], w.artefacts["scene"], w.truth)
@@ -95,15 +89,27 @@ def _scene(written: Sequence[Written]) -> Figures:
     return found | {FLAGS: float(flags)}
 
 
-def _person(written: Sequence[Written]) -> Figures:
+def _person(_: str, written: Sequence[Written]) -> Figures:
+    """Errors of the keypoints; flags are the frames without a person.
+
+    ``keypoints`` includes the 10 to 20 mm by which detector and body model define a joint
+    differently. ``sides right``: share of the keypoints nearer to the joint of their own side, or
+    unknown.
+    """
     errors, right, known, missing = [], [], [], 0
     for one in written:
         with artefacts.read(one.artefacts["person"], PERSON) as person:
             points = person["joints"].astype(np.float64)
             missing += int(person["missing"].sum())
-        true = one.true()
-        errors.append(keypoint_errors(points, true.joints).ravel())
-        right.append(sides_right(points, true.joints).ravel())
+        with (
+            artefacts.read(one.artefacts["scene"], SCENE) as scene,
+            artefacts.read(one.truth, TRUTH) as true,
+        ):
+            fps = float(scene.attributes["fps"])
+            joints = true["joints"][match_times(one.truth, true["times"], scene["times"], fps)]
+        errors.append(distance(points, joints, JOINT_KEYPOINTS, JOINTS).ravel())
+        own, other = (distance(points, joints, SIDED, to) for to in (OWN_SIDE, OTHER_SIDE))
+        right.append(~(own > other).ravel())
         known.append(np.isfinite(points[:, :67]).all(-1).ravel())
     every = np.concatenate(errors)
     return {
@@ -115,76 +121,31 @@ def _person(written: Sequence[Written]) -> Figures:
     }
 
 
-def _object_track(written: Sequence[Written]) -> Figures:
-    errors = [
-        track_errors.measure(w.artefacts["scene"], w.artefacts["object_track"], w.truth, w.mesh)
-        for w in written
-    ]
-    found = _named(object_errors.figures(errors), OBJECT_FIGURES)
-    return found | {FLAGS: float(sum(e.flagged.sum() for e in errors))}
+def _fit(stage: str, written: Sequence[Written]) -> Figures:
+    """Errors of a fit by stage `metrics` on its artefact and the run's other artefacts.
 
-
-def _body_fit(written: Sequence[Written]) -> Figures:
-    return _bodies("body_fit", written)
-
-
-def _bodies(stage: str, written: Sequence[Written]) -> Figures:
-    surface, joints, hands, flagged = [], [], [], 0
+    Flags are the flagged frames of the object after ``object_track``, else of the body.
+    """
+    measured, flags = [], 0
     for one in written:
-        models = one.project.config.body_models
-        track = read_body(one.artefacts[stage], stage, models, one.gender)
-        true = one.true(track.model.num_vertices)
-        errors = truths.body_errors(true, track, 1.0)  # no accelerations
-        joints.append(errors["body_mpjpe"])
-        hands.append(errors["hand_mpjpe"].ravel())
-        flagged += int(track.flagged.sum())
-        if true.vertices is not None:
-            pairs = zip(track.vertices(), true.vertices, strict=True)
-            surface.append(np.array([body.vertex_error(v, known) for v, known in pairs]))
-    found = {"MPJPE mm": joints, "hands mm": hands} | ({"PVE mm": surface} if surface else {})
-    return {name: 1e3 * float(np.concatenate(v).mean()) for name, v in found.items()} | {
-        FLAGS: float(flagged)
-    }
-
-
-def _joint(written: Sequence[Written]) -> Figures:
-    found = _bodies("joint", written)
-    shift, turn, touching, truly = [], [], [], []
-    for one in written:
-        mesh, track = one.mesh, read_object(one.artefacts["joint"], "joint")
-        fitted = read_body(
-            one.artefacts["joint"], "joint", one.project.config.body_models, one.gender
-        )
-        true = one.true()
-        errors = truths.object_errors(true.rotation, true.translation, track, mesh, 1.0)
-        shift.append(errors["object_translation"])
-        turn.append(errors["object_rotation"])
-        surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-        faces = fitted.model.faces.numpy()
-        tree = SurfaceTree(fitted.model.template.numpy(), faces)
-        touched = np.stack(
-            [
-                contact.vertex_contact(
-                    surface.contact_distance(
-                        BodySurface(vertices.astype(np.float64), faces, tree),
-                        track.rotation[t],
-                        track.translation[t],
-                        1.01 * CONTACT_M,
-                    )
-                )
-                for t, vertices in enumerate(fitted.vertices())
-            ]
-        )
-        regions = fitted.model.regions
-        touching.append(contact.region_contact(touched, regions, METRIC_REGIONS).ravel())
-        truly.append(true.contact_region.ravel())
-    counts = contact.confusion(np.concatenate(touching), np.concatenate(truly))
-    return found | {
-        "object mm": 1e3 * float(np.median(np.concatenate(shift))),
-        "object p95 mm": 1e3 * float(np.percentile(np.concatenate(shift), 95)),
-        "object p95 deg": float(np.percentile(np.concatenate(turn), 95)),
-        "contact F1": contact.f1(counts),
-    }
+        config = one.project.config
+        without_verdict = config.metrics.model_copy(update={"hold_out": False})
+        config = config.model_copy(update={"metrics": without_verdict})
+        output = one.artefacts[stage].with_suffix(".metrics.h5")
+        run_step(
+            "metrics", replace(one.project, config=config), one.sequence, inputs=one.artefacts,
+            output=output,
+        )  # fmt: skip
+        measured.append(SequenceMetrics.read(output))
+        if stage == "object_track":
+            flagged = read_object(one.artefacts[stage], stage).flagged
+        else:
+            models = one.project.models(one.sequence)
+            flagged = read_body(
+                one.artefacts[stage], stage, models.body_models, models.gender
+            ).flagged
+        flags += int(flagged.sum())
+    return _named(truth_figures(measured, stage), FIT_FIGURES) | {FLAGS: float(flags)}
 
 
 def _named(found: Figures, names: dict[str, str]) -> Figures:
@@ -194,40 +155,13 @@ def _named(found: Figures, names: dict[str, str]) -> Figures:
 _OF_STAGE = {
     "scene": _scene,
     "person": _person,
-    "object_track": _object_track,
-    "body_fit": _body_fit,
-    "joint": _joint,
+    **dict.fromkeys(("object_track", "body_fit", "joint"), _fit),
 }
 STAGES_WITH_FIGURES = tuple(_OF_STAGE)
 
 
-def keypoint_errors(points: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """Distance (T, K) of ``JOINT_KEYPOINTS`` of (T, 135, 3) from the joints (T, 55, 3).
-
-    NaN for unknown keypoints. Includes the 10 to 20 mm by which detector and body model define a
-    joint differently.
-    """
-    true = true_joints[:, [JOINT_INDEX[KEYPOINT_NAMES[k]] for k in JOINT_KEYPOINTS]]
-    return np.linalg.norm(points[:, list(JOINT_KEYPOINTS)] - true, axis=-1)
-
-
-def sides_right(points: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """Mask (T, S) of the ``SIDED`` keypoints nearer to the joint of their own side.
-
-    ``points`` is (T, 135, 3), ``true_joints`` (T, 55, 3). True for unknown keypoints.
-    """
-    own, other = (
-        np.linalg.norm(
-            points[:, list(SIDED)] - true_joints[:, [JOINT_INDEX[n] for n in names]], axis=-1
-        )
-        for names in (
-            [KEYPOINT_NAMES[k] for k in SIDED],
-            [_mirrored(KEYPOINT_NAMES[k]) for k in SIDED],
-        )
-    )
-    return ~(own > other)
-
-
-def _mirrored(name: str) -> str:
-    side, _, part = name.partition("_")
-    return f"{'right' if side == 'left' else 'left'}_{part}"
+def distance(
+    points: np.ndarray, joints: np.ndarray, keypoints: list[int], to: list[int]
+) -> np.ndarray:
+    """Distance (T, K) of ``keypoints`` of (T, 135, 3) from the joints ``to`` of (T, 55, 3)."""
+    return np.linalg.norm(points[:, keypoints] - joints[:, to], axis=-1)

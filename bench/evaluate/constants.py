@@ -11,6 +11,7 @@ import ast
 import re
 from collections import Counter
 
+from bench.changed_constant import bound_constants
 from intercap_core.shipped import PACKAGE
 
 SOURCE = re.compile(
@@ -32,26 +33,12 @@ def count_constants(text: str) -> Counter[str]:
     counts: Counter[str] = Counter()
     lines = text.splitlines()
     for node in ast.parse(text).body:
-        if isinstance(node, ast.AnnAssign):
-            targets: list[ast.expr] = [node.target]
-        elif isinstance(node, ast.Assign):
-            targets = node.targets
-        else:
-            continue
-        if node.value is None or not _is_numeric(node.value):
-            continue
-        names = [n for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
-        names = [name for name in names if name.id.lstrip("_").isupper()]
+        names = bound_constants(node, keys_too=True)
         comment = _comment(lines, node.lineno, node.end_lineno or node.lineno)
         counts["constants"] += len(names)
         counts["source"] += len(names) * bool(SOURCE.search(comment))
         counts["tuned"] += len(names) * bool(TUNED.search(comment))
     return counts
-
-
-def _is_numeric(value: ast.expr) -> bool:
-    parts = [node for node in ast.walk(value) if isinstance(node, ast.Constant)]
-    return bool(parts) and all(type(node.value) in (int, float) for node in parts)
 
 
 def _comment(lines: list[str], first: int, last: int) -> str:
