@@ -35,7 +35,7 @@ from torch import Tensor
 
 from bench.body_baseline import STAGES, FrameFit, fit_by_lbfgs
 from bench.clips import BodyClip
-from bench.command import add_figures, from_command_line
+from bench.command import from_command_line, report_figures
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.maps import maps_path
@@ -43,7 +43,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.start import place_trunk
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 
@@ -177,48 +176,11 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         "frames": len(clip),
         "threads": THREADS,
     }
-    add_figures(output, "body", figures)
-    rows = {
-        f"ours, {len(recording)} frames at once": fit,
-        f"ours, {len(clip)} frames at once": together,
-        "ours, frame by frame": alone,
-        f"the recipe, {len(whole)} frames": recipe,
-        "its last stage, warm": quick,
-        "until our accuracy" if is_as_good else "until its best": reached,
-    }
-    title = f"{sequence}: {len(recording.seen.rig)} views, {THREADS} threads each"
-    _print(title, rows, figures)
-    print(output)
+    report_figures(output, "body", figures)
 
 
 def _milliseconds_an_evaluation(fits: list[FrameFit]) -> float:
     return 1e3 * float(np.median(np.concatenate([np.diff(fit.seconds) for fit in fits])))
-
-
-def _print(title: str, rows: dict[str, Run], figures: dict[str, float]) -> None:
-    console = standard_console()
-    table = ListTable("body", "ms a frame", "times ours", "mm a vertex", "worst frame", title=title)
-    least = next(iter(rows.values())).seconds
-    for name, run in rows.items():
-        table.add_row(
-            name, f"{1e3 * run.seconds:.0f}", f"{run.seconds / least:.1f}",
-            f"{run.pve_mm:.1f}", f"{run.pve.max():.1f}",
-        )  # fmt: skip
-    console.print(table)
-    console.print(
-        f"speed-up {figures['speedup_recipe']:.0f} over the recipe, "
-        f"{figures['speedup_accuracy']:.0f} over its quickest way",
-        highlight=False,
-    )
-    forward = ListTable(f"body model, {BATCH} bodies", "forward, ms", "with gradient, ms")
-    for name, key in (
-        ("ours", "forward"),
-        ("body-models", "forward_body_models"),
-        ("smplfitter", "forward_smplfitter"),
-    ):
-        times = (figures[f"{key}{kind}_ms_b{BATCH}"] for kind in ("", "_backward"))
-        forward.add_row(name, *(f"{ms:.0f}" for ms in times))
-    console.print(forward)
 
 
 BATCH = 32

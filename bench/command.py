@@ -1,4 +1,4 @@
-"""Command line, output file and figure class that the comparisons share."""
+"""Command line, output file and tables of the scripts that measure speed."""
 
 from __future__ import annotations
 
@@ -16,6 +16,15 @@ def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
     """Write ``<area>.<measure>`` to the JSON file, in place of the area's older figures."""
     new = {f"{area}.{key}": round(float(value), 4) for key, value in figures.items()}
     replace_figures(output, new, (f"{area}.",))
+
+
+def report_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
+    """Write the figures of an area (:func:`add_figures`), and print them as tables."""
+    from bench.evaluate.tables import print_figures
+
+    add_figures(output, area, figures)
+    print_figures({f"{area}.{key}": float(value) for key, value in figures.items()})
+    print(output)
 
 
 def replace_figures(output: Path, figures: Mapping[str, float], prefixes: tuple[str, ...]) -> None:

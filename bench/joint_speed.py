@@ -23,9 +23,8 @@ import numpy as np
 import torch
 
 from bench.clips import JointClip, JointErrors, read_state
-from bench.command import add_figures, from_command_line
+from bench.command import from_command_line, report_figures
 from bench.joint_baseline import STEPS, Energy, refine
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
@@ -78,17 +77,7 @@ def measure(settings: Path, output: Path, steps: int) -> None:
         "frames": len(clip),
         "threads": THREADS,
     }
-    add_figures(output, "joint", figures)
-    rows = {
-        "sequential fits": (0.0, 0, start),
-        "ours": (seconds, 0, reached),
-        "the recipe": (recipe.seconds[-1], recipe.steps[-1], end),
-        "until our accuracy" if is_as_good else "until its best": (
-            recipe.seconds[at], recipe.steps[at], found[at],
-        ),
-    }  # fmt: skip
-    _print(f"{sequence}: {len(clip)} frames, {THREADS} threads each", rows, figures)
-    print(output)
+    report_figures(output, "joint", figures)
 
 
 def _errors(prefix: str, errors: JointErrors) -> dict[str, float]:
@@ -99,31 +88,6 @@ def _known(output: Path, key: str) -> dict[str, float]:
     """The figure of ``intercap dev bench`` that is in the output, which this area would replace."""
     known = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
     return {key.partition(".")[2]: known[key]} if key in known else {}
-
-
-def _print(
-    title: str, rows: dict[str, tuple[float, int, JointErrors]], figures: dict[str, float]
-) -> None:
-    console = standard_console()
-    heads = ("joint", "seconds", "times ours", "steps", "body, mm", "object, mm", "mean")
-    table = ListTable(*heads, title=title)
-    for name, (seconds, steps, errors) in rows.items():
-        table.add_row(
-            name, f"{seconds:.1f}", f"{seconds / rows['ours'][0]:.1f}", str(steps or ""),
-            f"{errors.pve:.2f}", f"{errors.object_:.2f}", f"{errors.mean:.2f}",
-        )  # fmt: skip
-    console.print(table)
-    console.print(
-        f"{figures['seconds_per_frame']:.3f} s a frame; speed-up {figures['speedup_recipe']:.0f} "
-        f"over the recipe, {figures['speedup_accuracy']:.0f} to "
-        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy",
-        highlight=False,
-    )
-    if figures["sequential_reaches_our_accuracy"]:
-        console.print(
-            "The sequential fits, where both start, are as good as ours by this measure already: "
-            "how soon the recipe is says little."
-        )
 
 
 if __name__ == "__main__":

@@ -26,15 +26,15 @@ import torch
 from rich.progress import track
 
 from bench.clips import ObjectClip
-from bench.command import add_figures, from_command_line
+from bench.command import from_command_line, report_figures
 from bench.object_baseline import FrameFit, Recipe, fit_by_adam
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.object_track.fit import FIT_ROUNDS, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.motion import extrapolate, predict_prior
+from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import load_project
 
@@ -112,7 +112,7 @@ def run_tracker(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEA
     """Run the whole stage; without ``start`` it searches the first pose."""
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
-        tracker = clip.tracker()
+        tracker = Tracker(clip.observer())
         begin = time.process_time()
         track = tracker.run([] if start is None else [_given(start)])
         seconds.append(time.process_time() - begin)
@@ -205,7 +205,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     clip = ObjectClip.load(project, sequence, frames)
     start = clip.annotated
     warm = ObjectClip.load(project, sequence, 2)  # compiles and imports
-    warm.tracker().run([_given(start)])
+    Tracker(warm.observer()).run([_given(start)])
     milliseconds_a_step(warm, start, 3)
 
     ours, single = run_tracker(clip, start), run_single_pass(clip, start)
@@ -238,14 +238,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         "threads": THREADS,
     }
     compared = compare_recordings(RECORDINGS, frames)
-    add_figures(output, "object", {**figures, **compared_figures(compared)})
-    title = (
-        f"{sequence}: {len(clip)} frames, {len(clip.views[0])} views, {len(clip.mesh.faces)} "
-        f"faces, {THREADS} thread{'s' * (THREADS > 1)} each"
-    )
-    _print(title, ours, single, found, reached, figures)
-    print_compared(compared)
-    print(output)
+    report_figures(output, "object", {**figures, **compared_figures(compared)})
 
 
 def compare_recordings(settings: Path, frames: int) -> dict[str, tuple[Run, Run]]:
@@ -282,58 +275,6 @@ def compared_figures(found: Mapping[str, tuple[Run, Run]]) -> dict[str, float]:
     nearer = (ours.translation_mm[0] < recipe.translation_mm[0] for ours, recipe in found.values())
     figures["all_nearer_count"] = float(sum(nearer))
     return figures
-
-
-def print_compared(found: Mapping[str, tuple[Run, Run]]) -> None:
-    """Print one row per object and one of all frames; ours, then the recipe."""
-    ours, recipe = (Run.pooled([pair[i] for pair in found.values()]) for i in (0, 1))
-    heads = ("mm (p95)", "degrees (p95)", "lost", "ms")
-    table = ListTable("object", *heads, *(f"recipe: {head}" for head in heads))
-    table.title = f"the whole track and the paper's recipe, {ours.frames} frames"
-    for name, pair in {**found, "all": (ours, recipe)}.items():
-        cells = []
-        for run in pair:
-            cells += ["{:.2f} ({:.2f})".format(*e) for e in (run.translation_mm, run.rotation_deg)]
-            cells += [f"{run.lost:.3f}", f"{run.ms:.0f}"]
-        table.add_row(name, *cells)
-    console = standard_console()
-    console.print(table)
-
-
-def _print(
-    title: str,
-    ours: Run,
-    single: Run,
-    found: list[tuple[int, Run]],
-    reached: Run,
-    figures: dict[str, float],
-) -> None:
-    console = standard_console()
-    table = ListTable(
-        "tracking", "ms a frame", "times ours", "mm (p95)", "degrees (p95)", "lost",
-        title=title,
-    )  # fmt: skip
-
-    def row(name: str, run: Run) -> None:
-        errors = ("{:.2f} ({:.2f})".format(*e) for e in (run.translation_mm, run.rotation_deg))
-        table.add_row(
-            name, f"{run.ms:.1f}", f"{run.ms / ours.ms:.1f}", *errors, f"{run.lost:.2f}"
-        )  # fmt: skip
-
-    row("ours, the whole track", ours)
-    row("ours, one pass of fits", single)
-    for steps, run in found:
-        mark = " *" if run is reached else ""
-        name = "the paper's recipe" if steps == Recipe.steps else f"Adam, {steps} steps"
-        row(name + mark, run)
-    console.print(table)
-    console.print(
-        f"search for the start: {figures['search_ms']:.0f} ms; an Adam step: "
-        f"{figures['baseline_ms_per_step']:.1f} ms; speed-up "
-        f"{figures['speedup_recipe']:.1f} over the recipe, {figures['speedup_accuracy']:.1f} to "
-        f"{'our' if figures['baseline_reaches_our_accuracy'] else 'its best'} accuracy (*)",
-        highlight=False,
-    )
 
 
 if __name__ == "__main__":

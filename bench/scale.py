@@ -19,7 +19,7 @@ from pathlib import Path
 import h5py
 import yaml
 
-from bench.command import add_figures, from_command_line
+from bench.command import from_command_line, report_figures
 from intercap_core.errors import UserError
 from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums, remember_output
 from intercap_core.pipeline.provenance import write_manifest
@@ -58,9 +58,7 @@ def measure(settings: Path, output: Path, count: int) -> None:
         annotation.unlink()
         shutil.rmtree(here / project.results)
         figures["dry_all_s"] = _cpu_seconds(here, "run", "--", "-n", "--quiet")
-    for key, value in figures.items():
-        print(f"scale.{key} {value:.2f}")
-    add_figures(output, "scale", figures)
+    report_figures(output, "scale", figures)
 
 
 def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
@@ -130,31 +128,30 @@ def _copy(source: Project, before: Path, name: str, project: Project, other: str
 def _cpu_seconds(here: Path, *arguments: str) -> float:
     """CPU seconds of a command on the project, including its children."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    verb, *rest = arguments
-    done = subprocess.run(
-        [sys.executable, "-m", "intercap_core.cli", verb, "config.yaml", *rest],
-        cwd=here, env=_environment(), capture_output=True, text=True,
-    )  # fmt: skip
-    if done.returncode:
-        raise UserError(f"intercap {verb} failed: {done.stderr.strip()[-500:]}")
+    _intercap(here, *arguments)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _jobs(here: Path) -> int:
-    done = subprocess.run(
-        [sys.executable, "-m", "intercap_core.cli", "run", "config.yaml", "--", "-n"],
-        cwd=here, env=_environment(), capture_output=True, text=True,
-    )  # fmt: skip
-    found = JOBS.search(done.stdout + done.stderr)
+    """Number of jobs of a dry run."""
+    text = _intercap(here, "run", "--", "-n")
+    found = JOBS.search(text)
     if found is None:
-        raise UserError(f"Snakemake named no jobs: {done.stderr.strip()[-500:]}")
+        raise UserError(f"Snakemake named no jobs: {text.strip()[-500:]}")
     return int(found.group(1))
 
 
-def _environment() -> dict[str, str]:
+def _intercap(here: Path, verb: str, *arguments: str) -> str:
+    """Run a command on the project; returns what it prints."""
     root = Path(__file__).resolve().parents[1]
-    return {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, "-m", "intercap_core.cli", verb, "config.yaml", *arguments],
+        cwd=here, env={**os.environ, "PYTHONPATH": str(root)}, capture_output=True, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        raise UserError(f"intercap {verb} failed: {done.stderr.strip()[-500:]}")
+    return done.stdout + done.stderr
 
 
 if __name__ == "__main__":

@@ -7,20 +7,18 @@ process: wall seconds and peak memory.
 
 from __future__ import annotations
 
-import argparse
 import http.server
-import json
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-from bench.command import exit_on_user_error
-from bench.stage_resources import lengthen
+from bench.command import from_command_line, report_figures
+from bench.stage_resources import lengthen, peak_mb, run_apart
 from intercap_core import artefacts
 from intercap_core.errors import UserError
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import SUMMARY
 from intercap_core.stage_list import STAGES
@@ -35,8 +33,6 @@ def measure(settings: Path, output: Path, count: int) -> None:
 
     Raises UserError if no sequence of the project is completely computed.
     """
-    from bench.command import add_figures
-
     project = load_project(settings)
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
@@ -46,27 +42,23 @@ def measure(settings: Path, output: Path, count: int) -> None:
             raise UserError(f"{project.results}: no sequence is computed; run `make demo` first")
         for name in names:
             _lengthen(project, name, long / name)
-        page = _timed("page", settings, names[0], long / names[0])
-        figures["page_s"] = page["seconds"]
+        figures["page_s"], _ = _timed("page", settings, names[0], long / names[0])
         folder_of_page = long / names[0] / "page"
         figures["page_mb"] = (folder_of_page / "index.html").stat().st_size / MEGABYTE
         viewer = sum(p.stat().st_size for p in folder_of_page.iterdir()) / MEGABYTE
         figures["viewer_mb_300"] = viewer - figures["page_mb"]
-        seconds = load_seconds(folder_of_page)
-        if seconds is not None:
-            figures["viewer_load_s_300"] = seconds
+        load = load_seconds(folder_of_page)
+        if load is not None:
+            figures["viewer_load_s_300"] = load
         summed = [_timed("summary", settings, name, long / name) for name in names]
-        figures["summary_s"] = max(one["seconds"] for one in summed)
+        figures["summary_s"] = max(seconds for seconds, _ in summed)
         many = Path(folder) / "many"
         _repeat(project, [long / name / "summary.h5" for name in names], many, count)
-        merged = _timed("merge", settings, "", many)
-        figures[f"aggregate_s_{count}"] = merged["seconds"]
-        figures[f"aggregate_mb_{count}"] = merged["peak_mb"]
+        seconds, peak = _timed("merge", settings, "", many)
+        figures[f"aggregate_s_{count}"], figures[f"aggregate_mb_{count}"] = seconds, peak
         figures["overview_mb"] = (many / "merged" / "site" / "index.html").stat().st_size / MEGABYTE
-        figures["one_more_s"] = figures["summary_s"] + merged["seconds"] + page["seconds"]
-    for key, value in figures.items():
-        print(f"dataset.{key} {value:.2f}")
-    add_figures(output, "dataset", figures)
+        figures["one_more_s"] = figures["summary_s"] + seconds + figures["page_s"]
+    report_figures(output, "dataset", figures)
 
 
 def load_seconds(folder: Path) -> float | None:
@@ -141,21 +133,15 @@ def _repeat(project: Project, summaries: list[Path], folder: Path, count: int) -
         assert last.attributes["sequence"] == path.stem
 
 
-def _timed(what: str, settings: Path, sequence: str, folder: Path) -> dict[str, float]:
-    """Seconds and peak memory of a function in a separate process."""
-    command = [
-        sys.executable, "-m", "bench.scale_report", str(settings),
-        "--one", what, "--sequence", sequence, "--folder", str(folder),
-    ]  # fmt: skip
+def _timed(what: str, settings: Path, sequence: str, folder: Path) -> tuple[float, float]:
+    """Seconds, start of the process included, and peak megabytes of :func:`_work`."""
     started = time.perf_counter()
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-    seconds = time.perf_counter() - started
-    if done.returncode:
-        raise UserError(f"{folder}: {what} failed; see the lines above")
-    return {"seconds": seconds, **json.loads(done.stdout.splitlines()[-1])}
+    peak = run_apart(_work, what, settings, sequence, folder)
+    return time.perf_counter() - started, peak
 
 
-def _work(what: str, settings: Path, sequence: str, folder: Path) -> None:
+def _work(what: str, settings: Path, sequence: str, folder: Path) -> float:
+    """Merge the summaries in ``folder``, or run stage ``what`` there; returns peak megabytes."""
     project = load_project(settings)
     if what == "merge":
         from intercap_core.stages import dataset
@@ -170,33 +156,16 @@ def _work(what: str, settings: Path, sequence: str, folder: Path) -> None:
             formats=project.config.export.formats,
         )
     else:
-        from intercap_core.pipeline.step import run_step
-
         row = project.sequences[sequence]  # the truth is of the frames that were recorded
         project.sequences[sequence] = row.model_copy(update={"truth": None})
         inputs = {stage: folder / f"{stage}.h5" for stage in STAGES[what].reads}
         output = folder / (what if STAGES[what].writes_folder else f"{what}.h5")
         run_step(what, project, sequence, inputs=inputs, output=output)
-    from bench.stage_resources import peak_mb
-
-    print(json.dumps({"peak_mb": peak_mb()}))
-
-
-def _main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("settings", type=Path, nargs="?", default=Path("config/demo/config.yaml"))
-    parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    parser.add_argument("--sequences", type=int, default=SEQUENCES)
-    parser.add_argument("--one", choices=("page", "summary", "merge"), help=argparse.SUPPRESS)
-    parser.add_argument("--sequence", default="", help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    with exit_on_user_error():
-        if given.one:
-            _work(given.one, given.settings, given.sequence, given.folder)
-        else:
-            measure(given.settings, given.output, given.sequences)
+    return peak_mb()
 
 
 if __name__ == "__main__":
-    _main()
+    from_command_line(
+        measure, (__doc__ or "").splitlines()[0], SEQUENCES, "sequences",
+        settings=Path("config/demo/config.yaml"),
+    )  # fmt: skip

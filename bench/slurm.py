@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from xml.etree import ElementTree
 
-from bench.command import add_figures
+from bench.command import report_figures
 
 OUTPUT = Path("results/bench.json")
 
@@ -47,9 +47,7 @@ def main() -> int:
     if not measured["faults_tried"]:
         print("no fault was tried: Slurm cannot be started here (see above)", file=sys.stderr)
         return status or 1
-    add_figures(OUTPUT, "slurm", measured)
-    for name, value in measured.items():
-        print(f"slurm.{name}: {value:g}")
+    report_figures(OUTPUT, "slurm", measured)
     return status
 
 

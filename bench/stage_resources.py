@@ -28,14 +28,14 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ from intercap_core.pipeline.step import run_step, run_studio
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
+Returned = TypeVar("Returned")
 FROM_ARTEFACTS = tuple(name for name, stage in STAGES.items() if len(stage.reads) > 1)
 MEGABYTE = 1 << 10  # in kilobytes
 LONG_RECORDING = 18_000  # frames: 10 minutes at 30 per second
@@ -210,25 +211,32 @@ class Row(NamedTuple):
     """Peak resident memory, megabytes."""
 
 
-def run_apart(settings: Path, stage: str, *options: str) -> Row | None:
-    """Run a stage in a separate process with ``options`` of this command; print and return its row.
+def run_apart(function: Callable[..., Returned], *arguments: object) -> Returned:
+    """Call ``function`` in a new process, which starts like a job of the workflow."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
 
-    Returns None if it failed.
+
+def run_stages(
+    settings: Path, stages: Sequence[str], folder: Path | None, cameras: int
+) -> list[Row]:
+    """Run each stage in a new process; print and return the rows of those that do not fail.
+
+    Arguments as of :func:`run`.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "bench.stage_resources", str(settings), "--stage", stage, *options],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    if done.returncode:
-        print(f"{stage} failed", flush=True)
-        return None
-    cameras, frames, seconds, mb = done.stdout.splitlines()[-1].split()
-    row = Row(stage, int(cameras), int(frames), float(seconds), float(mb))
-    print(
-        f"{stage}\t{cameras} cameras\t{frames} frames\t{row.seconds:.1f} s\t{row.mb:.0f} MB",
-        flush=True,
-    )
-    return row
+    rows = []
+    for stage in stages:
+        try:
+            row = run_apart(run, settings, stage, folder, cameras)
+        except Exception as error:  # the other stages are measured nevertheless
+            print(f"{stage} failed: {error}", flush=True)
+            continue
+        rows.append(row)
+        print(
+            f"{stage}\t{row.cameras} cameras\t{row.frames} frames\t{row.seconds:.1f} s\t"
+            f"{row.mb:.0f} MB", flush=True,
+        )  # fmt: skip
+    return rows
 
 
 def measure(settings: Path, frames: int, stages: Sequence[str], cameras: int = 0) -> list[Row]:
@@ -243,9 +251,7 @@ def measure(settings: Path, frames: int, stages: Sequence[str], cameras: int = 0
         for stage in (name for name in STAGES if name in made):
             source = project.artefact(sequence, stage)
             lengthen(source, stage, Path(folder) / f"{stage}.h5", frames)
-        options = ("--folder", folder, "--cameras", str(cameras))
-        rows = [run_apart(settings, stage, *options) for stage in stages]
-    return [row for row in rows if row]
+        return run_stages(settings, stages, Path(folder), cameras)
 
 
 def measure_rig(settings: Path, cameras: int, stages: Sequence[str]) -> list[Row]:
@@ -257,8 +263,7 @@ def measure_rig(settings: Path, cameras: int, stages: Sequence[str]) -> list[Row
     run_studio(project, next(iter(project.sequences)))
     order = list(STAGES)
     order = order[: 1 + max(order.index(stage) for stage in stages)]
-    rows = [run_apart(settings, stage, "--cameras", str(cameras)) for stage in order]
-    return [row for row in rows if row]
+    return run_stages(settings, order, None, cameras)
 
 
 class Law(NamedTuple):
@@ -305,10 +310,12 @@ def print_laws(rows: Sequence[Row]) -> None:
         )
 
 
-def run(settings: Path, stage: str, folder: Path | None, cameras: int) -> None:
-    """Run one stage on the artefacts in ``folder`` (None = those of the project with ``cameras``).
+def run(settings: Path, stage: str, folder: Path | None, cameras: int) -> Row:
+    """Run one stage in this process and return its figures.
 
-    Prints cameras, frames, CPU seconds and peak megabytes.
+    Args:
+        folder: artefacts that the stage reads; None = those of the project.
+        cameras: as in :func:`load_rig`.
     """
     project = load_rig(settings, cameras)
     sequence = next(iter(project.sequences))
@@ -324,7 +331,7 @@ def run(settings: Path, stage: str, folder: Path | None, cameras: int) -> None:
     seconds, mb = time.process_time(), peak_mb()
     with artefacts.read(frames, schemas.FRAMES) as read:
         count, present = read["colour_index"].shape
-    print(f"{present} {count} {seconds:.2f} {mb:.1f}", flush=True)
+    return Row(stage, present, count, seconds, mb)
 
 
 def _main() -> None:
@@ -333,13 +340,9 @@ def _main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[])
     parser.add_argument("--cameras", type=int, nargs="+", default=[])
     parser.add_argument("--stages", nargs="+", choices=FROM_ARTEFACTS, default=FROM_ARTEFACTS)
-    parser.add_argument("--stage", help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     settings, stages = given.settings, given.stages
-    if given.stage:
-        run(settings, given.stage, given.folder, *given.cameras)
-    elif given.cameras and not given.frames:
+    if given.cameras and not given.frames:
         for cameras in given.cameras:
             measure_rig(settings, cameras, stages)
     else:

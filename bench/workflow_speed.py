@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.command import replace_figures
+from bench.evaluate.tables import print_figures
 from intercap_core import artefacts
-from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.commands.run import snakemake_command
 from intercap_core.errors import UserError
 from intercap_core.pipeline.step import run_step
@@ -52,43 +52,39 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     figures: dict[str, float] = {}
     seconds_of_jobs: dict[int, float] = {}  # by number of frames
     for sequence in project.sequences:
-        found, frames, cameras = _measure_sequence(project, sequence, cores)
+        found, frames = _measure_sequence(project, sequence, cores)
         seconds_of_jobs[frames] = frames * sum(
             found[f"{stage}.seconds_per_frame"] for stage in MEASURED
         )
-        _print(found, f"{sequence}: {frames} frame sets of {cameras} cameras")
         if figures:
             found = {f"{key}_{frames}": value for key, value in found.items()}
         else:
             found |= time_extraction(project, sequence, frames)
             found |= time_hold_out(settings, sequence, frames)
-            _print_details(found)
         figures |= found
     if len(seconds_of_jobs) > 1:
-        hours = figures["scale.intercap_core_hours"] = core_hours(seconds_of_jobs)
-        print(f"InterCap, {INTERCAP[1]:,} frames: {hours:.1f} core hours")
+        figures["scale.intercap_core_hours"] = core_hours(seconds_of_jobs)
     areas = tuple({f"{key.partition('.')[0]}." for key in figures})
     replace_figures(output, figures, areas)
+    print_figures(figures)
     print(output)
 
 
-def _measure_sequence(
-    project: Project, sequence: str, cores: int
-) -> tuple[dict[str, float], int, int]:
-    """Compute a sequence; return its figures, and its numbers of frames and cameras."""
+def _measure_sequence(project: Project, sequence: str, cores: int) -> tuple[dict[str, float], int]:
+    """Compute a sequence; return its figures and its number of frames."""
     recordings = project.recordings_made(sequence)
     if recordings is not None:
         _run(project, recordings / "capture.json", cores)
     shutil.rmtree(project.results / sequence, ignore_errors=True)
     seconds, peak = _run(project, project.artefact(sequence, "metrics"), cores)
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as source:
-        frames, cameras = source["colour_index"].shape
+        frames = len(source["colour_index"])
     figures = {
         "end_to_end.seconds_per_frame": round(seconds / frames, 4),
         "end_to_end.peak_memory_mb": round(peak / (1 << 20), 1),
         **_stages(project, sequence, frames),
     }
-    return figures, frames, cameras
+    return figures, frames
 
 
 def core_hours(seconds: Mapping[int, float]) -> float:
@@ -189,25 +185,3 @@ def time_hold_out(settings: Path, sequence: str, frames: int) -> dict[str, float
                 seconds[hold_out].append(time.perf_counter() - start)
     with_it, without = (statistics.median(seconds[hold_out][1:]) for hold_out in (True, False))
     return {"verdict.seconds_per_frame": round((with_it - without) / frames, 4)}
-
-
-def _print(figures: dict[str, float], title: str) -> None:
-    table = ListTable("stage", "seconds a frame", "peak memory, MB", title=title)
-    for area in ("end_to_end", *MEASURED):
-        memory = figures.get(f"{area}.peak_memory_mb")
-        table.add_row(
-            area,
-            f"{figures[f'{area}.seconds_per_frame']:.3f}",
-            "" if memory is None else f"{memory:.0f}",
-        )
-    standard_console().print(table)
-
-
-def _print_details(figures: dict[str, float]) -> None:
-    print(
-        f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
-        f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
-        f"{figures['frames.recorded_bytes_per_set'] / 1e6:.2f} MB "
-        f"(ratio {figures['frames.bytes_ratio']:.3f})"
-    )
-    print(f"of the metrics, the verdict: {figures['verdict.seconds_per_frame']:.3f} s a frame")
