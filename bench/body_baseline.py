@@ -102,9 +102,8 @@ def fit_by_lbfgs(
     cloud: PersonCloud | None,
     start: Tensor,
     stages: tuple[Stage, ...] = STAGES,
-    rounds: int = ROUNDS,
 ) -> FrameFit:
-    """Fit frame ``t`` from the body ``start`` (P,) through ``stages`` of at most ``rounds``."""
+    """Fit frame ``t`` from the body ``start`` (P,) through ``stages``."""
     begin = time.process_time()
     free = Free(model)
     x = free.of(start).requires_grad_(True)
@@ -125,7 +124,7 @@ def fit_by_lbfgs(
             return loss
 
         before = None
-        for _ in range(rounds):
+        for _ in range(ROUNDS):
             loss = optimiser.step(closure).item()
             if not np.isfinite(loss):
                 raise FloatingPointError(f"the baseline's energy is {loss} in frame {t}")

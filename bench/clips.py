@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from intercap_core import artefacts
-from intercap_core.artefacts import read
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
@@ -41,10 +40,9 @@ from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import State
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
-from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
-from intercap_core.schemas import BODY_FIT, FRAMES, JOINT, OBJECT_TRACK, SCENE
+from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
 
 # Error of an annotated pose, rotation (rad) and translation (m), as in the evaluation's annotations
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)
@@ -118,26 +116,19 @@ class ObjectClip:
         """Seconds between frames."""
         return float(np.median(np.diff(self.times)))
 
-    def tracker(self) -> Tracker:
-        """The project's tracker on these frames."""
-        return Tracker(self.observer())
-
     def observer(self) -> Observer:
         """The observer of one pass of the tracker over the images."""
+        labels = [[[k.label for k in view.candidates] for view in views] for views in self.views]
         return Observer(
             self.mesh,
             self.views.__getitem__,
-            self._labels_by_view,
+            labels,
             self.settings,
             self.times,
             labels=self.labels,
             up=self.up,
             joints=self.joints,
         )
-
-    @cached_property
-    def _labels_by_view(self) -> list[list[list[str]]]:
-        return [[[k.label for k in view.candidates] for view in views] for views in self.views]
 
     def errors(self, poses: np.ndarray, frames: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
         """Errors (...) of poses (..., 4, 4) in the given frames, millimetres and degrees."""
@@ -152,6 +143,20 @@ class ObjectClip:
     def seen(self) -> np.ndarray:
         """Mask (T,) of the frames that are evaluated: two cameras truly see the object."""
         return self.true_views >= SEEN_VIEWS
+
+
+def _load_truth(project: Project, sequence: str, seen: Observations, model: BodyModel) -> Truth:
+    """Truth at the times of the observations; raises UserError if it has no skin for the model."""
+    path = project.sequences[sequence].truth
+    with artefacts.read(project.artefact(sequence, "scene"), SCENE) as scene:
+        fps = float(scene.attributes["fps"])
+    truth = path and Truth.load(path, seen.times, fps, model.num_vertices)
+    if truth is None or truth.vertices is None:
+        raise UserError(
+            f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
+            "recording with the body model that it was made for"
+        )
+    return truth
 
 
 _CHUNK = 32  # bodies posed at once
@@ -181,15 +186,9 @@ class BodyClip:
             project.artefact(sequence, stage) for stage in ("frames", "scene", "person")
         )
         seen = read_observations(scene, person)
-        with read(frames, FRAMES) as artefact:
-            fps = float(artefact.attributes["fps"])
-        truth = row.truth and Truth.load(row.truth, seen.times, fps, model.num_vertices)
-        if truth is None or truth.vertices is None:
-            raise UserError(
-                f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
-                "recording with the body model that it was made for"
-            )
+        truth = _load_truth(project, sequence, seen, model)
         clouds = list(person_clouds(frames, person, seen, settings.points_per_frame))
+        assert truth.vertices is not None
         return cls(model, seen, clouds, settings, truth.vertices)
 
     def __len__(self) -> int:
@@ -290,12 +289,7 @@ class JointClip:
         problem.columns = torch.arange(start.body.shape[1])
         field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
         geometry = Geometry(model, mesh, field, contact_patches(model))
-        truth = row.truth and Truth.load(row.truth, seen.times, fps, model.num_vertices)
-        if truth is None or truth.vertices is None:
-            raise UserError(
-                f"sequence {sequence} has no true skin for {model.path}; measure a virtual "
-                "recording with the body model that it was made for"
-            )
+        truth = _load_truth(project, sequence, seen, model)
         with Frames.open(paths["frames"]) as frames:
             source = ObjectRecording(
                 frames, Detections.load(paths["detections"]), paths["scene"], paths["person"],

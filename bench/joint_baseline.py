@@ -32,7 +32,6 @@ from torch import Tensor
 from bench.body_energy import BodyEnergy
 from bench.clips import JointClip
 from bench.object_baseline import Crops, ObjectImages
-from bench.object_baseline import Recipe as ObjectRecipe
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body_fit.term_inputs import Bodies
 from intercap_core.geometry.camera.transforms import rigid
@@ -41,10 +40,7 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.proximity import proximity
 from intercap_core.joint.skin import SURFACE_SIGMA, VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT_SHIFT, OBJECT_TURN, State
-from intercap_core.joint.terms.motion import (
-    ACCELERATION_OUTLIER,
-    BODY_ACCELERATION,
-)
+from intercap_core.joint.terms.motion import ACCELERATION_OUTLIER, BODY_ACCELERATION
 from intercap_core.joint.terms.penetration import PENETRATION_SIGMA, PENETRATION_TOLERANCE
 
 STEPS = 700  # of L-BFGS: 100 and 600
@@ -92,8 +88,8 @@ class Energy:
             "object_data": OBJECT_WEIGHT * self._images(posed.rotation, posed.translation),
             "contact": settings.contact_weight * contact(distance[:, at_patch], self._contact),
             "penetration": settings.penetration_weight * penetration(distance, clip.geometry),
-            "body_motion": settings.body_smoothness * body_motion(posed.joints, clip.fps),
-            "object_motion": settings.object_smoothness * object_motion(posed.moments, clip.fps),
+            "body_motion": settings.body_smoothness * accelerations(posed.joints, clip.fps),
+            "object_motion": settings.object_smoothness * accelerations(posed.moments, clip.fps),
         }
         if clip.floor is not None:
             found["ground"] = settings.ground_weight * ground(posed, clip, self._standing)
@@ -183,7 +179,7 @@ def object_images(clip: JointClip) -> ObjectImages:
         for t, (views, pose) in enumerate(zip(clip.views, poses, strict=True))
     }
     seen = {t: crop for t, crop in crops.items() if crop is not None}
-    return ObjectImages(clip.tracked, seen, ObjectRecipe())
+    return ObjectImages(clip.tracked, seen)
 
 
 def contact_weights(geometry: Geometry, touching: np.ndarray) -> Tensor:
@@ -228,17 +224,8 @@ def _height(points: Tensor, clip: JointClip) -> Tensor:
     return ((points - point) @ normal).clamp(max=0)
 
 
-def body_motion(joints: Tensor, fps: float) -> Tensor:
-    """E_S of joints (T, 55, 3)."""
-    return _accelerations(joints, fps)
-
-
-def object_motion(moments: Tensor, fps: float) -> Tensor:
-    """E_A of points with the object's moments (T, 6, 3)."""
-    return _accelerations(moments, fps)
-
-
-def _accelerations(points: Tensor, fps: float) -> Tensor:
+def accelerations(points: Tensor, fps: float) -> Tensor:
+    """E_S of joints (T, 55, 3), E_A of points with the object's moments (T, 6, 3)."""
     ahead, now, behind = points[2:], points[1:-1], points[:-2]
     scaled = (behind - 2 * now + ahead) * fps**2 / (BODY_ACCELERATION * ACCELERATION_OUTLIER)
     return ACCELERATION_OUTLIER**2 * ((1 + (scaled**2).sum(-1)).sqrt() - 1).sum()

@@ -41,16 +41,18 @@ LIKELY_LABEL_BONUS = 0.05  # added to the overlap
 MIN_PIXELS = 20  # of a mask, as in the public code
 
 
+DEPTH_WEIGHT = 1e4  # lambda_depth over lambda_segm, per m^2
+DEPTH_SCALE_M = 0.05  # of Geman-McClure
+
+
 @dataclass(frozen=True)
 class Recipe:
-    """Steps and weights of the baseline."""
+    """Steps of the baseline."""
 
     first_steps: int = 400
     steps: int = 150
     learning_rate_m: float = 1e-3
     learning_rate_rad: float = 1e-3
-    depth_weight: float = 1e4  # lambda_depth over lambda_segm, per m^2
-    depth_scale_m: float | None = 0.05  # of Geman-McClure; None for equation 1's squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ def fit_by_adam(
     crops = Crops.cut(mesh, views, pose, min_overlap, labels)
     if crops is None:
         return FrameFit(pose[None], np.zeros(1))
-    images, start = ObjectImages(mesh, {0: crops}, recipe), torch.tensor(pose[:3, :3]).float()
+    images, start = ObjectImages(mesh, {0: crops}), torch.tensor(pose[:3, :3]).float()
     turn = torch.zeros(3, requires_grad=True)
     place = torch.tensor(pose[:3, 3], dtype=torch.float32, requires_grad=True)
     adam = torch.optim.Adam(
@@ -198,17 +200,17 @@ def registered_depth(
 class ObjectImages:
     """Equation 1 of T frames with V views in all, in torch; all views are drawn as one image.
 
-    The sum over mask pixels of (1 - coverage)^2 and, if measured and drawn, depth_weight times the
-    squared difference of depths.
+    The sum over mask pixels of (1 - coverage)^2 and, if measured and drawn, ``DEPTH_WEIGHT`` times
+    the robust square of the difference of depths.
     """
 
-    def __init__(self, mesh: ObjectMesh, crops: Mapping[int, Crops], recipe: Recipe) -> None:
+    def __init__(self, mesh: ObjectMesh, crops: Mapping[int, Crops]) -> None:
         """``crops`` by frame; frames without views are omitted."""
 
         def tensor(values: list[np.ndarray]) -> torch.Tensor:
             return torch.as_tensor(np.concatenate(values).astype(np.float32))
 
-        self._recipe, self._empty, views = recipe, not crops, list(crops.values())
+        self._empty, views = not crops, list(crops.values())
         if self._empty:
             return
         self._frame = torch.tensor([t for t, crop in crops.items() for _ in crop.lens])
@@ -235,9 +237,8 @@ class ObjectImages:
         coverage, depth = self._draw(Project.apply(local, self._lens), local[..., 2])
         drawn = (self._depth > 0) & (coverage.detach() > COVERED)
         squared = torch.where(drawn, depth - self._depth, 0) ** 2
-        if self._recipe.depth_scale_m is not None:
-            squared = geman_mcclure(squared, self._recipe.depth_scale_m).rho
-        return ((1 - coverage) ** 2).sum() + self._recipe.depth_weight * squared.sum()
+        robust = geman_mcclure(squared, DEPTH_SCALE_M).rho
+        return ((1 - coverage) ** 2).sum() + DEPTH_WEIGHT * robust.sum()
 
 
 class Project(torch.autograd.Function):
