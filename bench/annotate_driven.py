@@ -15,8 +15,6 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,11 +33,11 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.object_errors import ObjectErrors
-from intercap_core.evaluation.truth import match_times
+from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import runs
 from intercap_core.project import Project, load_project
-from intercap_core.schemas import METRIC_REGIONS, SCENE, TRUTH
+from intercap_core.schemas import METRIC_REGIONS, SCENE
 
 OBJECT, CONTACT = "racquet_swing_s11", "bottle_drink_s02"
 APART = (4, 2, 1)  # frames between poses: at first, where it is still lost after a run, and again
@@ -69,22 +67,12 @@ class Eye:
     def of(cls, project: Project, name: str) -> Eye:
         truth, entry = project.sequences[name].truth, project.object_of(name)
         assert truth is not None and entry is not None
-        with (
-            artefacts.read(project.artefact(name, "scene"), SCENE) as scene,
-            artefacts.read(truth, TRUTH) as true,
-        ):
-            at = match_times(truth, true["times"], scene["times"], float(scene.attributes["fps"]))
-            cameras = dict(
-                zip(
-                    true.text("camera_names"),
-                    np.linalg.inv(true["master_from_colour"]),
-                    strict=True,
-                )
-            )
-            return cls(
-                true["rotation"][at], true["translation"][at], true["object_views"][at],
-                cameras, ObjectMesh.load(entry),
-            )  # fmt: skip
+        with artefacts.read(project.artefact(name, "scene"), SCENE) as scene:
+            true = Truth.load(truth, scene["times"], float(scene.attributes["fps"]), 0)
+        poses = np.linalg.inv(true.master_from_colour)
+        cameras = dict(zip(true.camera_names, poses, strict=True))
+        mesh = ObjectMesh.load(entry)
+        return cls(true.rotation, true.translation, true.object_views, cameras, mesh)
 
     def centre(self, frame: int, camera: str) -> np.ndarray:
         """The object's centre (3,) in the true camera's frame."""
@@ -339,10 +327,10 @@ def _apply_edit(hand: Hand, part: str, wanted: list[Interval]) -> bool:
         meant = [true for true in wanted if _meet(one, true)]
         others = [bar for bar in shown if bar != one and meant and _meet(bar, meant[0])]
         if not meant or (len(meant) == 1 and others):
-            _select(hand, part, one)
+            hand.click(_bar(part, one))
             hand.key("Delete")
         elif len(meant) > 1:
-            _select(hand, part, one)
+            hand.click(_bar(part, one))
             hand.go_to(meant[0][1])
             hand.key("k")
         elif one[0] != meant[0][0]:
@@ -377,10 +365,6 @@ def _bar(part: str, one: Interval) -> str:
     return f'[data-interval="{part}:{one[0]}:{one[1]}"]'
 
 
-def _select(hand: Hand, part: str, one: Interval) -> None:
-    hand.click(_bar(part, one))
-
-
 def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> None:
     page = hand.visit.page
     page.locator(_bar(part, one)).scroll_into_view_if_needed()
@@ -393,14 +377,6 @@ def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> No
 
 
 # --- all of it ---------------------------------------------------------------------------------
-
-
-@contextmanager
-def open_page(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
-    """The sequence's page in a browser, with a server process of its own."""
-    with annotate_page.served_page(settings, sequence, cores) as found:
-        found.page.wait_for_timeout(1000)
-        yield Hand(found)
 
 
 def compute_without_annotations(project: Project, cores: int) -> None:
@@ -435,7 +411,9 @@ def measure_sessions(settings: Path, cores: int) -> dict[str, float]:
     actions, seconds, whole = 0, 0.0, True
     for name, correct in ((OBJECT, correct_object), (CONTACT, correct_contact)):
         try:
-            with open_page(settings, name, cores) as hand:
+            with annotate_page.served_page(settings, name, cores) as shown:
+                shown.page.wait_for_timeout(1000)
+                hand = Hand(shown)
                 found |= correct(project, name, hand)
                 actions, seconds = actions + hand.actions, seconds + hand.seconds
         except (UserError, TimeoutError, Error) as error:

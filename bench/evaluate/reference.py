@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from intercap_core.commands.console import ListTable, standard_console
 from intercap_core.errors import UserError
@@ -33,74 +35,61 @@ class GateResult(StrEnum):
 FAILING = (GateResult.WORSE, GateResult.MISSING)
 
 
-@dataclass(frozen=True)
-class GatedFigure:
+class GatedFigure(BaseModel):
     """One entry of the reference file."""
 
-    key: str
-    """Key of the evaluation's JSON, "area.measure"."""
     value: float
     """The recorded figure, in the unit that ends its key."""
-    spread: float
+    spread: float = Field(ge=0)
     """Variation that is tolerated, same unit."""
-    higher_is_better: bool
+    better: Literal["lower", "higher"]
     """Direction in which a change is an improvement."""
 
     def judge(self, now: float | None) -> GateResult:
         """Compare the figure of a run (None = not measured) with the recorded value."""
         if now is None or not math.isfinite(now):
             return GateResult.MISSING
-        loss = self.value - now if self.higher_is_better else now - self.value
+        loss = self.value - now if self.better == "higher" else now - self.value
         if loss > self.spread:
             return GateResult.WORSE
         return GateResult.BETTER if loss < -self.spread else GateResult.SAME
 
 
-def read_reference(path: Path = REFERENCE) -> list[GatedFigure]:
+Reference = Mapping[str, GatedFigure]  # by key of the evaluation's JSON, "area.measure"
+
+
+def read_reference(path: Path = REFERENCE) -> Reference:
     """Gated figures of a reference file, in the file's order.
 
     Raises UserError if the file is missing or an entry is malformed.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        found = [
-            GatedFigure(
-                key,
-                float(entry["value"]),
-                float(entry["spread"]),
-                {"higher": True, "lower": False}[entry["better"]],
-            )
-            for key, entry in entries.items()
-        ]
+        return TypeAdapter(dict[str, GatedFigure]).validate_json(path.read_bytes())
     except FileNotFoundError:
         raise UserError(
             f"{path}: no such file; the quick evaluation is compared with it, restore it with "
             f"`git checkout {path}`"
         ) from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except ValidationError as error:
         raise UserError(
-            f"{path}: cannot be read as a reference ({error!r}); expected for each figure "
-            '{"value": number, "spread": number, "better": "lower" or "higher"}'
+            f"{path}: cannot be read as a reference ({error}); expected for each figure "
+            '{"value": number, "spread": number of at least 0, "better": "lower" or "higher"}'
         ) from None
-    invalid = [figure.key for figure in found if not figure.spread >= 0]
-    if invalid:
-        raise UserError(f"{path}: the spread of {invalid[0]} is not a number of at least 0")
-    return found
 
 
-def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) -> bool:
+def passes_gate(figures: Mapping[str, float], reference: Reference) -> bool:
     """Print every gated figure with its verdict; return whether none is worse or missing."""
     console = standard_console()
     table = ListTable("figure", "reference", "now", "spread", "result")
     table.title = "regression gate"
     failing = []
-    for figure in reference:
-        now = figures.get(figure.key)
+    for key, figure in reference.items():
+        now = figures.get(key)
         result = figure.judge(now)
         if result in FAILING:
-            failing.append(figure.key)
+            failing.append(key)
         table.add_row(
-            figure.key,
+            key,
             f"{figure.value:.3f}",
             "" if now is None else f"{now:.3f}",
             f"{figure.spread:.3f}",
@@ -124,9 +113,9 @@ def update_reference(figures: Mapping[str, float], path: Path = REFERENCE) -> No
     """
     reference = read_reference(path)
     missing = [
-        figure.key
-        for figure in reference
-        if figure.judge(figures.get(figure.key)) == GateResult.MISSING
+        key
+        for key, figure in reference.items()
+        if figure.judge(figures.get(key)) == GateResult.MISSING
     ]
     if missing:
         raise UserError(
@@ -134,12 +123,8 @@ def update_reference(figures: Mapping[str, float], path: Path = REFERENCE) -> No
             "from the file if they are no longer measured"
         )
     entries = {
-        figure.key: {
-            "value": figures[figure.key],
-            "spread": figure.spread,
-            "better": "higher" if figure.higher_is_better else "lower",
-        }
-        for figure in reference
+        key: json.dumps(figure.model_dump() | {"value": figures[key]})
+        for key, figure in reference.items()
     }
-    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(entry)}" for key, entry in entries.items())
+    lines = ",\n".join(f" {json.dumps(key)}: {entry}" for key, entry in entries.items())
     path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")

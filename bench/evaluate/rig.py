@@ -50,17 +50,11 @@ def measure(project: Project, sequence: str) -> list[RigErrors]:
     stage = StudioStage(
         project.captures[sequence], project.config.studio, project.object_of(sequence)
     )
-    found = [
-        _errors(
-            project, sequence, "person_depth" if depth else "person_colour",
-            [(paths.frames, paths.detections)], board=False,
-        )
-    ]  # fmt: skip
+    recorded: list[tuple[Path, Path | None]] = [(paths.frames, paths.detections)]
+    person = "person_depth" if depth else "person_colour"
+    found = [_errors(project, sequence, person, recorded)]
     if depth and stage.furnishing != "bare":
-        paths_of_both = [(paths.frames, paths.detections)]
-        found.append(
-            _errors(project, sequence, "background", paths_of_both, board=False, background=True)
-        )
+        found.append(_errors(project, sequence, "background", recorded))
     if not depth:
         folder = project.results / "boards" / sequence
         if not folder.exists():
@@ -74,7 +68,7 @@ def measure(project: Project, sequence: str) -> list[RigErrors]:
             update={"recordings": folder, "sequence": f"{sequence}_board", **nothing}
         )
         recorded = record(project, of_board, draft_rig(of_board, None, None), [])
-        found.append(_errors(project, sequence, "board", recorded, board=True))
+        found.append(_errors(project, sequence, "board", recorded))
     return found
 
 
@@ -83,18 +77,16 @@ def _errors(
     sequence: str,
     evidence: str,
     recorded: Sequence[tuple[Path, Path | None]],
-    *,
-    board: bool,
-    background: bool = False,
 ) -> RigErrors:
+    """Errors of the poses by ``evidence`` in frames and detections, see :class:`RigErrors`."""
     height = project.subjects[project.sequences[sequence].subject].height
     try:
         found = find_poses(
             recorded,
-            board=parse_board(BOARD) if board else None,
+            board=parse_board(BOARD) if evidence == "board" else None,
             height_m=height,
             distance=None,
-            background=background,
+            background=evidence == "background",
         )
     except UserError as error:
         return RigErrors(evidence, np.zeros(0), np.zeros(0), str(error))

@@ -16,8 +16,8 @@ from bench.evaluate.reference import (
 )
 from intercap_core.errors import UserError
 
-ERROR = GatedFigure("joint.body_pve_mm", 7.0, 0.5, higher_is_better=False)
-SCORE = GatedFigure("joint.contact_f1", 0.9, 0.05, higher_is_better=True)
+ERROR = GatedFigure(value=7.0, spread=0.5, better="lower")
+SCORE = GatedFigure(value=0.9, spread=0.05, better="higher")
 
 
 @pytest.mark.parametrize(
@@ -42,22 +42,23 @@ def test_figure_is_worse_beyond_its_spread_in_its_bad_direction(
 def test_gate_prints_all_figures_and_fails_on_worse_or_missing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    gate = [ERROR, SCORE]
-    assert passes_gate({ERROR.key: 7.2, SCORE.key: 0.95}, gate)
-    assert not passes_gate({ERROR.key: 8.0, SCORE.key: 0.95}, gate)
+    gate = {"error_mm": ERROR, "score": SCORE}
+    assert passes_gate({"error_mm": 7.2, "score": 0.95}, gate)
+    assert not passes_gate({"error_mm": 8.0, "score": 0.95}, gate)
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [ERROR.key, "7.000", "7.200", "0.500", "same"] in rows
-    assert [ERROR.key, "7.000", "8.000", "0.500", "worse"] in rows
-    assert not passes_gate({ERROR.key: 7.2}, gate)
-    assert "or missing: joint.contact_f1" in capsys.readouterr().out
+    assert ["error_mm", "7.000", "7.200", "0.500", "same"] in rows
+    assert ["error_mm", "7.000", "8.000", "0.500", "worse"] in rows
+    assert not passes_gate({"error_mm": 7.2}, gate)
+    assert "or missing: score" in capsys.readouterr().out
 
 
 def test_update_replaces_values_and_keeps_spreads(tmp_path: Path) -> None:
     path = tmp_path / "reference.json"
     entry = {"value": 7.0, "spread": 0.5, "better": "lower"}
-    path.write_text(json.dumps({ERROR.key: entry}))
-    update_reference({ERROR.key: 6.0, "not.gated": 1.0}, path)
-    assert read_reference(path) == [GatedFigure(ERROR.key, 6.0, 0.5, higher_is_better=False)]
-    with pytest.raises(UserError, match=r"not updated.*joint\.body_pve_mm"):
+    path.write_text(json.dumps({"error_mm": entry}))
+    update_reference({"error_mm": 6.0, "not.gated": 1.0}, path)
+    expected = {"error_mm": GatedFigure(value=6.0, spread=0.5, better="lower")}
+    assert read_reference(path) == expected
+    with pytest.raises(UserError, match=r"not updated.*error_mm"):
         update_reference({}, path)
-    assert read_reference(path)[0].value == 6.0
+    assert read_reference(path) == expected
