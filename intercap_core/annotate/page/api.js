@@ -44,7 +44,7 @@ export const post = async (path, content) =>
     method: "POST", body: JSON.stringify(content), headers: { "content-type": "application/json" },
   })).json();
 
-export const blob = async (path, signal) => (await request(path, { signal })).blob();
+export const blob = async (path) => (await request(path)).blob();
 
 /* Fetch header and arrays by name, as `unpack` of the viewer returns them. */
 export const fetchArrays = async (path) => window.unpack(await blob(path));

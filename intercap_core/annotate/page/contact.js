@@ -5,7 +5,7 @@
  * all estimated intervals into the draft, with uncertain ends. An end that is moved is exact. */
 import { fromBase64 } from "./api.js";
 import { UNCONFIRMED } from "./draft.js";
-import { intervals } from "./sides.js";
+import { intervals } from "./runs.js";
 
 const TOUCHING = 0.5; // least probability of estimated contact
 
@@ -58,51 +58,42 @@ export class Contact {
     this.app.draft.put({ contact: intervals, [UNCONFIRMED]: intervals.map(id).filter((key) => unconfirmed.has(key)) }, label);
   }
 
+  /* Replace an interval by others, of which the last one is selected. */
+  #replace(interval, parts, label, confirmed = true) {
+    const { all, unconfirmed } = this.#editable(), others = all.filter((other) => id(other) !== id(interval));
+    if (others.length === all.length) return;
+    unconfirmed.delete(id(interval));
+    if (!confirmed) parts.forEach((part) => unconfirmed.add(id(part)));
+    this.selected = parts.at(-1) ?? null;
+    this.#store([...others, ...parts], unconfirmed, label);
+  }
+
   /* Move the ends of an interval, which confirms it. */
   change(interval, start, end) {
-    const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
-    if (k < 0) return;
     const clamp = (v) => Math.max(0, Math.min(this.app.info.frames, Math.round(v)));
-    let changed = { ...all[k], start: clamp(start), end: clamp(end) };
-    for (const end of ["start", "end"]) if (changed[end] !== all[k][end]) changed = exact(changed, end);
-    if (changed.end <= changed.start) { this.app.say("contact would end before it starts"); return; }
-    all[k] = changed;
-    unconfirmed.delete(id(interval));
-    this.selected = changed;
-    this.#store(all, unconfirmed, "contact moved");
+    let changed = { ...interval, start: clamp(start), end: clamp(end) };
+    for (const end of ["start", "end"]) if (changed[end] !== interval[end]) changed = exact(changed, end);
+    if (changed.end > changed.start) this.#replace(interval, [changed], "contact moved");
+    else this.app.say("contact would end before it starts");
   }
 
   /* Mark the "start" or "end" as exact or uncertain. */
   setExact(interval, end, on) {
-    const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
-    if (k < 0) return;
-    all[k] = on ? exact(all[k], end) : { ...all[k], uncertain: isUncertain(all[k], OTHER[end]) ? "both" : end };
-    unconfirmed.delete(id(interval));
-    this.selected = all[k];
-    this.#store(all, unconfirmed, "uncertainty of contact changed");
+    const uncertain = { ...interval, uncertain: isUncertain(interval, OTHER[end]) ? "both" : end };
+    this.#replace(interval, [on ? exact(interval, end) : uncertain], "uncertainty of contact changed");
   }
 
-  confirm(interval) {
-    const { all, unconfirmed } = this.#editable();
-    unconfirmed.delete(id(interval));
-    this.selected = interval;
-    this.#store(all, unconfirmed, "contact confirmed");
-  }
+  confirm(interval) { this.#replace(interval, [interval], "contact confirmed"); }
 
   remove(interval) {
-    this.selected = null;
-    const { all, unconfirmed } = this.#editable(), kept = all.filter((other) => id(other) !== id(interval));
-    this.#store(kept, unconfirmed, "contact deleted");
-    if (!kept.length) this.app.say("Annotated: no contact at all. \"Discard, use the estimate\" removes this.");
+    this.#replace(interval, [], "contact deleted");
+    if (this.stated?.length === 0) this.app.say("Annotated: no contact at all. \"Discard, use the estimate\" removes this.");
   }
 
   split(interval, frame) {
     if (frame <= interval.start || frame >= interval.end) { this.app.say("go to a frame inside the interval to split it there"); return; }
-    const { all, unconfirmed } = this.#editable(), others = all.filter((other) => id(other) !== id(interval));
     const parts = [exact({ ...interval, end: frame }, "end"), exact({ ...interval, start: frame }, "start")];
-    if (unconfirmed.has(id(interval))) parts.forEach((part) => unconfirmed.add(id(part)));
-    this.selected = parts[1];
-    this.#store([...others, ...parts], unconfirmed, "contact split");
+    this.#replace(interval, parts, "contact split", this.isConfirmed(interval));
   }
 
   /* Add contact; overlapping intervals of the part are merged. Ends of `start` to `end` are exact, or those that

@@ -36,7 +36,7 @@ export class Copies {
 }
 
 /* Use the browser's storage; null if it is disabled or full. */
-function access(act) {
+export function access(act) {
   try { return act(localStorage); } catch { return null; }
 }
 

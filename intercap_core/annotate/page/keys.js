@@ -55,7 +55,7 @@ export function handleKey(app, event) {
     c: () => withContact(() => app.contact.confirm(interval)), k: () => withContact(() => app.contact.split(interval, app.frame)),
     "[": () => withContact(() => app.contact.change(interval, app.frame, interval.end)), "]": () => withContact(() => app.contact.change(interval, interval.start, app.frame + 1)),
     delete: remove, backspace: remove,
-    escape: () => { app.setMode(null); app.questions.current = null; app.sides.cancel(); app.contact.selected = null; app.timeline.draw(); app.panels(); },
+    escape: () => { app.setMode(null); app.questions.current = null; app.contact.selected = null; app.sides.cancel(); },
     "?": () => help(),
     " ": () => app.play(),
   }[letter];

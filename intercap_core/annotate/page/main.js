@@ -16,16 +16,14 @@ import { apply, invert } from "./geometry.js";
 import { handleKey, help } from "./keys.js";
 import { showList } from "./list.js";
 import { DroppedFrames, FloorMarks, SubjectMarks } from "./marks.js";
+import { Paint, SymmetryEditor } from "./object_settings.js";
 import { Overlay } from "./overlay.js";
-import { Paint } from "./paint.js";
 import { Pictures } from "./pictures.js";
 import { PoseEditor, objectPose, poseAt } from "./pose.js";
 import { Questions } from "./questions.js";
 import { Saving } from "./saving.js";
-import { Sides, legend } from "./sides.js";
-import { sidesPanel } from "./sides_panel.js";
+import { Sides, legend, sidesPanel } from "./sides.js";
 import { BEFORE, GREY, Space } from "./space.js";
-import { SymmetryEditor } from "./symmetry.js";
 import { Timeline } from "./timeline.js";
 import { Views } from "./views.js";
 
@@ -34,6 +32,7 @@ const OBJECT = [1.0, 0.62, 0.18], EDITED = [0.2, 0.85, 0.45];
 class App {
   constructor(info, copies) {
     this.info = info; // description of the sequence by the server
+    this.path = `sequences/${info.sequence}`; // of requests
     this.frame = 0;
     this.direction = 1;
     this.opacity = 0.62;
@@ -54,11 +53,7 @@ class App {
     this.timeline = new Timeline(this);
     this.questions = new Questions(this);
     this.saving = new Saving(this);
-    this.draft.addEventListener("change", () => {
-      this.timeline.draw();
-      this.panels();
-      this.redraw();
-    });
+    this.draft.addEventListener("change", () => this.refresh());
     this.#layerBar();
     this.#tabs();
     document.addEventListener("keydown", (event) => handleKey(this, event));
@@ -67,11 +62,10 @@ class App {
 
   // ---------------------------------------------------------------- loading
   async load() {
-    const path = `sequences/${this.info.sequence}`;
     this.show(0);
     if (this.info.object) {
       try {
-        const object = await fetchArrays(`${path}/object?v=${this.info.result}`);
+        const object = await fetchArrays(`${this.path}/object?v=${this.info.result}`);
         this.pose = new PoseEditor(this, object);
         this.paint = new Paint(this, object, this.paint);
         this.overlay?.mesh("object", object.arrays.faces, OBJECT);
@@ -99,7 +93,7 @@ class App {
     const again = [["Try again", () => this.reload()]];
     let info;
     try {
-      info = await get(`sequences/${this.info.sequence}`);
+      info = await get(this.path);
       if (!info.frames && this.info.frames) throw new Error(info.notes.join("; "));
     } catch (error) {
       banner("result", `${error.message} The page continues with the loaded data; your edits are kept.`, again);
@@ -116,7 +110,6 @@ class App {
     Object.assign(this.info, info);
     this.pictures = new Pictures(info.sequence, info.stamp);
     this.contact = new Contact(this);
-    this.timeline.contact = this.contact;
     this.views.views.forEach((view, k) => (view.camera = info.cameras[k] ?? view.camera));
     this.setMode(null);
     if (info.annotation.digest !== this.draft.file.digest && !this.draft.dirty && !info.annotation.problem) this.saved(info.annotation, true);
@@ -158,6 +151,13 @@ class App {
       this.waits = false;
       this.draw();
     });
+  }
+
+  /* Draw timeline, panels and views again. */
+  refresh() {
+    this.timeline.draw();
+    this.panels();
+    this.redraw();
   }
 
   draw() {
@@ -282,7 +282,6 @@ class App {
 
   /* Take over the file's new content after a save, by this page or by another annotator (`theirs`). */
   saved(annotation, theirs = false) {
-    this.info.annotation = annotation;
     const unedited = !this.draft.dirty;
     this.draft.rebase(annotation, theirs);
     if (unedited) this.draft.sections = structuredClone(this.draft.saved);

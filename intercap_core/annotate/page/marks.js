@@ -1,7 +1,7 @@
 /* Marks in the images: the subject, points of the floor, and frames to drop. */
 import { post } from "./api.js";
 import { button, make } from "./dom.js";
-import { runs } from "./timeline.js";
+import { runs } from "./runs.js";
 
 /* Clicks on the subject among several people. */
 export class SubjectMarks {
@@ -60,7 +60,7 @@ export class FloorMarks {
   async #add(view, event) {
     const { app } = this, [x, y] = view.pixel(event);
     try {
-      const { point } = await post(`sequences/${app.info.sequence}/point`, { camera: view.camera.name, frame: app.frame, x, y });
+      const { point } = await post(`${app.path}/point`, { camera: view.camera.name, frame: app.frame, x, y });
       app.draft.set("floor", [...(app.draft.get("floor") ?? []), point], "floor point");
     } catch (error) { app.say(error.message); }
   }

@@ -41,20 +41,14 @@ export class Pictures {
   fetch(camera, frame, width, urgent = true) {
     const key = this.#key(camera, frame, width);
     if (this.cache.has(key)) return Promise.resolve(this.cache.get(key).bitmap);
-    const waiting = this.waiting.get(key);
-    if (waiting) {
-      if (urgent && !waiting.urgent) {
-        waiting.urgent = true;
-        const position = this.queue.indexOf(waiting);
-        if (position >= 0) { this.queue.splice(position, 1); this.queue.unshift(waiting); }
-      }
-      return waiting.promise;
+    let job = this.waiting.get(key);
+    if (!job) {
+      job = { key, camera, frame, width };
+      job.promise = new Promise((resolve) => (job.resolve = resolve));
+      this.waiting.set(key, job);
+      this.queue.push(job);
     }
-    const job = { key, camera, frame, width, urgent };
-    job.promise = new Promise((resolve) => (job.resolve = resolve));
-    this.waiting.set(key, job);
-    if (urgent) this.queue.unshift(job);
-    else this.queue.push(job);
+    if (urgent && this.queue.includes(job)) this.queue = [job, ...this.queue.filter((other) => other !== job)];
     this.#next();
     return job.promise;
   }

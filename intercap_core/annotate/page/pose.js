@@ -202,7 +202,7 @@ export class PoseEditor {
       else app.say(`frame ${frame}: ${text}`);
     };
     try {
-      const fit = await post(`sequences/${app.info.sequence}/snap`, {
+      const fit = await post(`${app.path}/snap`, {
         frame, rotation_vector: rotationVector(pose), translation: pose.map((row) => row[3]),
       });
       if (!this.fits.has(frame)) return; // the pose was removed

@@ -26,7 +26,7 @@ export class Questions {
 
   async load() {
     if (!this.app.info.frames) return;
-    try { this.#setList(await get(`sequences/${this.app.info.sequence}/questions`)); } catch (error) { this.app.say(error.message); }
+    try { this.#setList(await get(`${this.app.path}/questions`)); } catch (error) { this.app.say(error.message); }
     this.app.panels();
   }
 
@@ -39,7 +39,7 @@ export class Questions {
     this.pending = [];
     if (unanswered) await this.load();
     for (const { answered } of effective) {
-      try { this.#setList((await post(`sequences/${this.app.info.sequence}/answer`, answered)).questions); } catch (error) { this.app.say(error.message); }
+      try { this.#setList((await post(`${this.app.path}/answer`, answered)).questions); } catch (error) { this.app.say(error.message); }
     }
     this.app.panels();
   }
@@ -85,7 +85,7 @@ export class Questions {
       this.list = this.list.filter(({ id }) => id !== question.id);
       this.pending.at(-1).steps = draft.undoSteps.length + (mode ? 1 : 0);
     } else {
-      try { this.#setList((await post(`sequences/${app.info.sequence}/answer`, answered)).questions); } catch (error) { app.say(error.message); return; }
+      try { this.#setList((await post(`${app.path}/answer`, answered)).questions); } catch (error) { app.say(error.message); return; }
     }
     this.current = null;
     app.panels();

@@ -13,7 +13,6 @@ const POSES = ["object_poses", "object_pose"]; // two forms of one section; a fi
 export class Saving {
   constructor(app) {
     this.app = app;
-    this.path = `sequences/${app.info.sequence}`;
     this.faults = [];
     this.run = { state: "none" };
     this.stale = null;
@@ -63,7 +62,7 @@ export class Saving {
   async check() {
     const { app } = this, request = this.lastCheck = {}; // answers may arrive out of order
     let faults;
-    try { faults = (await post(`${this.path}/check`, { changes: app.draft.changes() })).faults; } catch (error) { faults = [{ where: "", message: error.message }]; }
+    try { faults = (await post(`${this.app.path}/check`, { changes: app.draft.changes() })).faults; } catch (error) { faults = [{ where: "", message: error.message }]; }
     if (request !== this.lastCheck) return;
     this.faults = faults;
     this.showStatus();
@@ -76,7 +75,7 @@ export class Saving {
     find("save").disabled = !changed.length || Boolean(app.info.read_only);
     const fault = this.faults[0];
     find("status").className = fault ? "fault" : changed.length ? "open" : "dim";
-    find("status").textContent = fault ? fault.message : changed.length ? `not saved: ${changed.map(readable).join(", ")}` : app.info.annotation.text ? "saved" : "no annotation yet";
+    find("status").textContent = fault ? fault.message : changed.length ? `not saved: ${changed.map(readable).join(", ")}` : app.draft.file.text ? "saved" : "no annotation yet";
   }
 
   /* Save once at a time. */
@@ -94,7 +93,7 @@ export class Saving {
     if (!Object.keys(changes).length) { app.say(app.paint?.changed ? "the painted surface has its own save button, under Object" : "there is nothing to save"); return; }
     if (app.info.read_only) { app.say(app.info.read_only); return; }
     let result;
-    try { result = await post(`${this.path}/check`, { changes }); } catch (error) { app.say(error.message); return; }
+    try { result = await post(`${this.app.path}/check`, { changes }); } catch (error) { app.say(error.message); return; }
     this.faults = result.faults;
     this.showStatus();
     if (result.faults.length) {
@@ -102,7 +101,7 @@ export class Saving {
       return;
     }
     const effect = make("p", { data: { part: "stale" } }, "Determining the stages that a run would compute…");
-    post(`${this.path}/check`, { changes, plan: true }).then(({ stale }) => {
+    post(`${this.app.path}/check`, { changes, plan: true }).then(({ stale }) => {
       effect.textContent = stale?.length ? `A run would compute: ${stale.map(({ stage }) => readable(stage)).join(", ")}.` : "Nothing needs to be run.";
     }, (error) => { effect.textContent = error.message; });
     const unfinished = [app.sides.open.size ? "left and right" : "", app.dropped.from === null ? "" : "frames to drop"].filter(Boolean);
@@ -111,7 +110,7 @@ export class Saving {
       [["save", "Save", true], ...(app.info.profile ? [] : [["run", "Save and run"]]), ["", "Cancel"]]);
     if (!answer) return;
     try {
-      app.saved(await post(`${this.path}/save`, { digest: app.draft.file.digest, text: app.draft.file.text, changes }));
+      app.saved(await post(`${this.app.path}/save`, { digest: app.draft.file.digest, text: app.draft.file.text, changes }));
       app.say("saved");
       app.questions.saved();
     } catch (error) {
@@ -139,7 +138,6 @@ export class Saving {
     if (!answer) return;
     const edits = structuredClone(mine);
     app.draft.rebase(now, true);
-    app.info.annotation = now;
     app.draft.reapply(edits);
     banner("changed", "");
     if (answer === "theirs") { app.draft.revert("their version"); return; }
@@ -151,7 +149,7 @@ export class Saving {
     const { app } = this;
     if (document.hidden) return;
     let now;
-    try { now = await get(`${this.path}/state`); } catch (error) {
+    try { now = await get(`${this.app.path}/state`); } catch (error) {
       banner("server", error.message);
       this.disconnected = true;
       return;
@@ -170,14 +168,14 @@ export class Saving {
   async showChange() {
     const { app } = this;
     let now;
-    try { now = await get(`${this.path}/annotation`); } catch (error) { app.say(error.message); this.reportedAnnotation = null; return; }
+    try { now = await get(`${this.app.path}/annotation`); } catch (error) { app.say(error.message); this.reportedAnnotation = null; return; }
     if (!app.draft.dirty && !now.problem) { app.saved(now, true); app.draft.revert("their version"); app.draft.undoSteps.pop(); app.draft.notify(); return; }
     await this.resolveConflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }
 
   /* List the stages that a run would compute. */
   async plan() {
-    try { this.stale = (await post(`${this.path}/check`, { changes: {}, plan: true })).stale ?? []; } catch (error) { this.app.say(error.message); }
+    try { this.stale = (await post(`${this.app.path}/check`, { changes: {}, plan: true })).stale ?? []; } catch (error) { this.app.say(error.message); }
     this.app.panels();
   }
 
@@ -185,7 +183,7 @@ export class Saving {
     const { app } = this;
     if (app.draft.dirty) { app.say("save first: a run reads the saved annotation"); return; }
     app.tab("run");
-    try { this.run = await post(`${this.path}/run`, { do: "start" }); } catch (error) { app.say(error.message); }
+    try { this.run = await post(`${this.app.path}/run`, { do: "start" }); } catch (error) { app.say(error.message); }
     app.panels();
     this.progress();
   }
@@ -193,7 +191,7 @@ export class Saving {
   async progress() {
     clearTimeout(this.runTimer);
     const { app } = this, before = this.run.state;
-    try { this.run = await get(`${this.path}/run`); } catch { /* poll() reports a lost connection */ }
+    try { this.run = await get(`${this.app.path}/run`); } catch { /* poll() reports a lost connection */ }
     if (IN_PROGRESS.includes(before) && !IN_PROGRESS.includes(this.run.state) && this.run.sequence === app.info.sequence) {
       this.stale = null;
       await app.reload();
@@ -205,7 +203,7 @@ export class Saving {
   }
 
   async stop() {
-    try { this.run = await post(`${this.path}/run`, { do: "stop" }); } catch (error) { this.app.say(error.message); }
+    try { this.run = await post(`${this.app.path}/run`, { do: "stop" }); } catch (error) { this.app.say(error.message); }
     this.app.panels();
   }
 
@@ -213,7 +211,7 @@ export class Saving {
   async compare() {
     const { app } = this;
     try {
-      this.comparison = await get(`${this.path}/comparison`);
+      this.comparison = await get(`${this.app.path}/comparison`);
       if (this.comparison.exists) await app.loadBefore(); else app.say("no run from this page has replaced a result yet");
     } catch (error) { app.say(error.message); }
     app.panels();

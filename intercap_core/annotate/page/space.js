@@ -6,7 +6,7 @@ import { apply, compose, invert } from "./geometry.js";
 import { posedFrames } from "./pose.js";
 
 export const GREY = [0.62, 0.62, 0.64]; // colour of the body while left and right are coloured
-const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
+const BODY = [0.42, 0.66, 0.92];
 export const BEFORE = [0.72, 0.5, 0.95];
 
 export class Space {
@@ -20,15 +20,14 @@ export class Space {
     const { app } = this;
     find("space").replaceChildren(make("p", { class: "dim" }, "Loading the body and the 4D viewer (some MB)… Images and marks can already be used."));
     try {
-      const data = await fetchArrays(`sequences/${app.info.sequence}/viewer?v=${app.info.result}`), { header, arrays } = data;
+      const data = await fetchArrays(`${app.path}/viewer?v=${app.info.result}`), { header, arrays } = data;
       find("space").replaceChildren(viewerElement());
       await window.showInterCap(data);
       this.viewer = window.intercapViewer;
       if (!this.viewer) throw new Error("this browser cannot draw in 3D");
       this.main = Object.keys(header.versions)[0];
       app.overlay?.mesh("body", arrays.faces, BODY, arrays[`${this.main}/rest`]);
-      this.skin = skinPaint(header, arrays);
-      this.regionOf = arrays["contact/region"];
+      this.data = data;
       this.centresFrame = -1;
       this.master_from_zup = invert(app.info.zup_from_master);
     } catch (error) {
@@ -55,7 +54,7 @@ export class Space {
   async loadBefore() {
     const { app } = this, before = {};
     for (const name of ["object", "viewer"]) {
-      try { before[name] = await fetchArrays(`sequences/${app.info.sequence}/${name}?version=before&v=${app.info.result}`); } catch { /* the old result did not have it */ }
+      try { before[name] = await fetchArrays(`${app.path}/${name}?version=before&v=${app.info.result}`); } catch { /* the old result did not have it */ }
     }
     const { viewer } = before;
     if (viewer && app.overlay) {
@@ -78,9 +77,10 @@ export class Space {
       bodies.push({ name: "before", pose: this.before.master_from_zup });
     }
     if (this.viewer) {
-      const body = this.viewer.versions[this.main];
+      const body = this.viewer.versions[this.main], { position, color } = body.mesh.geometry.attributes;
       body.pose(frame);
-      overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact && !layers.sides, layers.sides ? GREY : BODY));
+      window.paintContact(body.mesh, frame, this.data.header, this.data.arrays, layers.sides ? GREY : BODY, layers.contact && !layers.sides);
+      overlay.move("body", position.array, color.array); // the viewer paints its own colours before it draws
       bodies.push({ name: "body", pose: this.master_from_zup });
     }
     return bodies;
@@ -162,7 +162,7 @@ export class Space {
 
   /* Centres of the body parts whose probability of contact is at least 0.25, master frame. */
   #centres() {
-    const { app } = this, { regions } = app.contact, region = this.regionOf, vertices = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
+    const { app } = this, { regions } = app.contact, region = this.data.arrays["contact/region"], vertices = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
     if (!region) return [];
     const sums = regions.map((part) => ({ part, share: app.contact.probabilityAt(part, app.frame) ?? 0, count: 0, sum: [0, 0, 0] }));
     for (let v = 0; v < region.length; v += 1) {
@@ -174,25 +174,6 @@ export class Space {
     return sums.filter(({ count }) => count).map(({ part, share, count, sum }) =>
       ({ part, share, point: apply(this.master_from_zup, sum.map((v) => v / count)) }));
   }
-}
-
-/* Returns a function of the frame for the colours of the body's vertices (3 V numbers): red = the meshes
- * touch, orange = the part's probability of contact is at least 0.5 (128 / 255). */
-function skinPaint(header, arrays) {
-  const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
-  const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;
-  const colours = new Float32Array(3 * total), width = touching ? touching.length / header.frames : 0;
-  return (frame, shown, base) => {
-    for (let v = 0; v < total; v += 1) {
-      let colour = base;
-      if (shown && touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
-      else if (shown && region && region[v] < 255 && probability[frame * count + region[v]] >= 128) colour = STATED;
-      colours[3 * v] = colour[0];
-      colours[3 * v + 1] = colour[1];
-      colours[3 * v + 2] = colour[2];
-    }
-    return colours;
-  };
 }
 
 function viewerElement() {

@@ -2,14 +2,14 @@
 import { button, find, followPointer, make, refill, readable } from "./dom.js";
 import { OTHER, id, isUncertain } from "./contact.js";
 import { posedFrames } from "./pose.js";
-import { sidesRows } from "./sides_panel.js";
+import { runs } from "./runs.js";
+import { sidesRows } from "./sides.js";
 
 const SHOWN = 0.25; // a part has a row if its probability of contact reaches this value
 
 export class Timeline {
   constructor(app) {
     this.app = app;
-    this.contact = app.contact;
     this.extra = new Set();
     const slider = find("frame");
     slider.oninput = () => app.show(Number(slider.value));
@@ -20,6 +20,8 @@ export class Timeline {
     this.rows.onpointerdown = (event) => this.#seek(event);
     this.draw();
   }
+
+  get contact() { return this.app.contact; }
 
   /* CSS position of a frame on a lane. */
   at(t) { return `${(100 * t) / this.app.info.frames}%`; }
@@ -242,14 +244,4 @@ export class Timeline {
       this.#place(bar, Math.min(from, app.frame), Math.max(from, app.frame) + 1);
     }
   }
-}
-
-/* Runs of consecutive frames: [first, last]. */
-export function runs(frames) {
-  const runs = [];
-  for (const t of [...frames].sort((a, b) => a - b)) {
-    if (runs.length && runs.at(-1)[1] === t - 1) runs.at(-1)[1] = t;
-    else runs.push([t, t]);
-  }
-  return runs;
 }

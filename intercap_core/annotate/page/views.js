@@ -1,4 +1,5 @@
 /* Camera views of the same frame, some large and the others in a strip: image, overlay and marks. */
+import { access } from "./copies.js";
 import { find, followPointer, make } from "./dom.js";
 import { apply, project } from "./geometry.js";
 
@@ -14,8 +15,8 @@ export class Views {
     this.order = this.views.map((view) => view.index);
     this.large = Number(find("large").value);
     find("large").onchange = () => { this.large = Number(find("large").value); this.arrange(); };
-    find("quality").value = storedQuality() ?? "1";
-    find("quality").onchange = () => { storeQuality(find("quality").value); app.show(app.frame); };
+    find("quality").value = access((storage) => storage.getItem(QUALITY)) ?? "1";
+    find("quality").onchange = () => { access((storage) => storage.setItem(QUALITY, find("quality").value)); app.show(app.frame); };
     new ResizeObserver(() => this.#fit()).observe(find("views"));
     this.arrange();
   }
@@ -237,12 +238,4 @@ export class Views {
       ((x + 0.5 - view.crop[0]) / view.crop[2]) * view.width,
       ((y + 0.5 - view.crop[1]) / view.crop[3]) * view.height];
   }
-}
-
-function storedQuality() {
-  try { return localStorage.getItem(QUALITY); } catch { return null; } // storage is disabled
-}
-
-function storeQuality(value) {
-  try { localStorage.setItem(QUALITY, value); } catch { /* as above */ }
 }
