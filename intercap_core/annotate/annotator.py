@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import shlex
 import threading
@@ -16,15 +17,14 @@ from intercap_core import artefacts
 from intercap_core.annotate import document, objects, questions, rerun, result, snap
 from intercap_core.annotate.before import Backup
 from intercap_core.annotate.edits import list_edits
-from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.opened import NO_FILE, Opened, object_of, stamp_of
 from intercap_core.annotation import Annotation, ObjectPose
 from intercap_core.commands.check import fault_of_cameras
-from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.output.site.tables import sequence_table
-from intercap_core.project import Project, load_project
+from intercap_core.project import load_project
 from intercap_core.schemas import CONTACT_REGIONS, SUMMARY
 
 _LARGEST = 1e9  # largest number that the page may send
@@ -47,7 +47,7 @@ class Annotator:
         self.settings, self.by = settings, by
         self.project = load_project(settings)
         self.runs = rerun.RunManager(cores=cores, profile=profile)
-        self._list = SequenceList()
+        self._summary = functools.lru_cache(maxsize=10_000)(_read_summary)
         self._opened: OrderedDict[str, Opened] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -56,8 +56,40 @@ class Annotator:
     def sequences(self) -> dict[str, Any]:
         """Read the project again and return the table of sequences."""
         self.project = load_project(self.settings)
-        rows = self._list.rows(self.project)
+        rows = self._rows()
         return {"dataset": self.project.config.dataset, "by": self.by, "sequences": rows}
+
+    def _rows(self) -> list[dict[str, Any]]:
+        """Return a row per sequence, worst first as on the site, then those without a result.
+
+        A summary is read again only if its file changed.
+        """
+        rows, measured = [], []
+        for name, row in self.project.sequences.items():
+            path = self.project.artefact(name, "summary")
+            summary = self._summary(path, stamp_of(path))
+            entry: dict[str, Any] = {
+                "name": name, "subject": row.subject, "object": row.object or "", "rank": None,
+                "annotated": self.project.annotation_path(name).is_file(),
+                "note": summary if isinstance(summary, str) else "",
+            }  # fmt: skip
+            if isinstance(summary, SequenceMetrics):
+                measured.append(summary)
+                entry |= {
+                    "frames": len(summary),
+                    "flagged": summary.values["flagged"].sum(axis=0).tolist(),  # by part
+                    "errors": {
+                        e.part: round(e.stated, 1) if e.stated == e.stated else None
+                        for e in stated_errors(summary)
+                    },
+                }
+            rows.append(entry)
+        if measured:
+            table = sequence_table(measured, {})
+            ranks = dict(zip(table["sequence"], table["rank"], strict=True))
+            for entry in rows:
+                entry["rank"] = int(ranks[entry["name"]]) if entry["name"] in ranks else None
+        return sorted(rows, key=lambda entry: (entry["rank"] is None, entry["rank"] or 0))
 
     def opened(self, name: str, version: str = "now") -> Opened:
         """Return a sequence's artefacts: the present ones ("now") or the backup ("before").
@@ -136,7 +168,7 @@ class Annotator:
             return answer
         answer["difference"] = document.difference(now.text, text, now.path.name)
         if request.get("plan"):
-            annotation = Annotation.model_validate(document.sections_with(now, changes))
+            annotation = Annotation.model_validate(document.parsed(text))
             edited = rerun.EditedProject.of(self.project, name, annotation)
             answer["stale"] = rerun.stale_stages(edited, name)
         return answer
@@ -174,10 +206,9 @@ class Annotator:
 
     def snap(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Fit the object's pose to the images of a frame."""
-        entry, opened, pose = self._object(name), self.opened(name), _pose(request)
+        opened, pose = self.opened(name), _pose(request)
         _check_frame(opened, pose.frame)
-        start = list(pose.rotation_vector), list(pose.translation)
-        return snap.snap(opened, entry, pose.frame, *start)
+        return snap.snap(opened, object_of(self.project, name), pose)
 
     def point(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Return the 3D point at a pixel."""
@@ -188,7 +219,7 @@ class Annotator:
 
     def read_surface(self, name: str) -> dict[str, Any]:
         """Return the vertices of likely contact of the sequence's object."""
-        return objects.read_surface(self.project, self._object(name))
+        return objects.read_surface(self.project, object_of(self.project, name))
 
     def surface(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Save the vertices of likely contact of the object, for all of its sequences."""
@@ -197,21 +228,22 @@ class Annotator:
             raise UserError("vertices must be a list of vertex numbers")
         if any(not 0 <= v < _LARGEST for v in vertices):
             raise UserError("a vertex number is outside of the mesh")
-        digest = str(request["digest"])
-        saved = objects.save_surface(self.project, self._object(name), vertices, digest)
+        entry, digest = object_of(self.project, name), str(request["digest"])
+        saved = objects.save_surface(self.project, entry, vertices, digest)
         self.project = load_project(self.settings)
         return saved
 
     def read_symmetry(self, name: str) -> dict[str, Any]:
         """Return the symmetry of the sequence's object."""
-        return objects.read_symmetry(self.project, self._object(name))
+        return objects.read_symmetry(self.project, object_of(self.project, name))
 
     def symmetry(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Save the object's symmetry, for all of its sequences."""
         symmetry, digest = request["symmetry"], str(request["digest"])
         if not isinstance(symmetry, dict):
             raise UserError("symmetry must be discrete, continuous or sphere")
-        saved = objects.save_symmetry(self.project, self._object(name), symmetry, digest)
+        entry = object_of(self.project, name)
+        saved = objects.save_symmetry(self.project, entry, symmetry, digest)
         self.project = load_project(self.settings)
         return saved
 
@@ -233,12 +265,6 @@ class Annotator:
         progress = self.runs.progress(self.project)
         return progress | {"command": shlex.join(command), "cluster": cluster}
 
-    def _object(self, name: str) -> ObjectEntry:
-        entry = self.project.object_of(name)
-        if entry is None:
-            raise UserError(f"sequence {name!r} names no object")
-        return entry
-
     def _answers(self, name: str) -> Path:
         return questions.answers_path(self.project.annotation_path(name))
 
@@ -248,14 +274,10 @@ class Annotator:
         """Return faults of the changed annotation, and the file's changed text."""
         if now.problem:
             return [{"where": "file", "message": now.problem}], now.text
-        sections = document.sections_with(now, changes)
-        faults = document.faults(sections)
-        faults = faults or self._contradictions(name, Annotation.model_validate(sections))
-        if faults:
-            return faults, now.text
         text = document.patched(now, changes)
-        # an unchanged entry may have an invalid form, such as frame 12.0
-        return document.faults(document.parsed(text)), text
+        sections = document.parsed(text)
+        faults = document.faults(sections)
+        return faults or self._contradictions(name, Annotation.model_validate(sections)), text
 
     def _contradictions(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
         """Return contradictions between an annotation and the recording.
@@ -303,53 +325,12 @@ def _check_frame(opened: Opened, frame: int) -> None:
             raise UserError(f"there is no frame {frame}")
 
 
-class SequenceList:
-    """Rows of all sequences; a summary is read again only if its file changed."""
-
-    def __init__(self) -> None:
-        self._summaries: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
-
-    def rows(self, project: Project) -> list[dict[str, Any]]:
-        """Return a row per sequence, worst first as on the site, then those without a result."""
-        rows, measured = [], []
-        for name, row in project.sequences.items():
-            summary = self._summary(project.artefact(name, "summary"))
-            entry: dict[str, Any] = {
-                "name": name, "subject": row.subject, "object": row.object or "", "rank": None,
-                "annotated": project.annotation_path(name).is_file(),
-                "note": summary if isinstance(summary, str) else "",
-            }  # fmt: skip
-            if isinstance(summary, SequenceMetrics):
-                measured.append(summary)
-                entry |= {
-                    "frames": len(summary),
-                    "flagged": summary.values["flagged"].sum(axis=0).tolist(),  # by part
-                    "errors": {
-                        e.part: round(e.stated, 1) if e.stated == e.stated else None
-                        for e in stated_errors(summary)
-                    },
-                }
-            rows.append(entry)
-        if measured:
-            table = sequence_table(measured, {})
-            ranks = dict(zip(table["sequence"], table["rank"], strict=True))
-            for entry in rows:
-                entry["rank"] = int(ranks[entry["name"]]) if entry["name"] in ranks else None
-        return sorted(rows, key=lambda entry: (entry["rank"] is None, entry["rank"] or 0))
-
-    def _summary(self, path: Path) -> SequenceMetrics | str:
-        """Return a sequence's figures, or why there are none."""
-        try:
-            status = path.stat()
-        except OSError:
-            return "no result yet"
-        stamp = status.st_mtime_ns, status.st_size
-        known = self._summaries.get(path)
-        if known is None or known[0] != stamp:
-            try:
-                with artefacts.read(path, SUMMARY) as artefact:
-                    known = stamp, SequenceMetrics.of(artefact)
-            except UserError as error:
-                known = stamp, str(error)
-            self._summaries[path] = known
-        return known[1]
+def _read_summary(path: Path, stamp: str) -> SequenceMetrics | str:
+    """Return a sequence's figures, or why there are none; the stamp is that of the file."""
+    if stamp == NO_FILE:
+        return "no result yet"
+    try:
+        with artefacts.read(path, SUMMARY) as artefact:
+            return SequenceMetrics.of(artefact)
+    except UserError as error:
+        return str(error)

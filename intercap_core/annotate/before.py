@@ -64,7 +64,7 @@ class Backup:
 
     def compare(self) -> dict[str, Any]:
         """Compare the result with the backup: figures, and motion of body and object, mm."""
-        comparison: dict[str, Any] = {"rows": [], "exists": self.paths["joint"].is_file()}
+        comparison: dict[str, Any] = {"exists": self.paths["joint"].is_file()}
         state = self._state()
         if state is not None and comparison["exists"]:
             comparison |= {
@@ -73,9 +73,9 @@ class Backup:
                 "unfinished": not self._succeeded(state),
             }
         old, new = _figures(self.paths), _figures(self.artefacts)
-        for name in old | new:
-            row = {"name": name, "old": old.get(name), "new": new.get(name)}
-            comparison["rows"].append(row)
+        comparison["rows"] = [
+            {"name": name, "old": old.get(name), "new": new.get(name)} for name in old | new
+        ]
         with (
             contextlib.suppress(artefacts.Unreadable),
             artefacts.read(self.paths["joint"], JOINT) as a,
@@ -125,10 +125,8 @@ def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
     with contextlib.suppress(artefacts.Unreadable):
         metrics = SequenceMetrics.read(paths["metrics"])
         for error in stated_errors(metrics):
-            stated = error.stated if np.isfinite(error.stated) else None
-            rows[f"{error.part}, estimated error, mm"] = (
-                None if stated is None else round(stated, 1)
-            )
+            stated = round(error.stated, 1) if np.isfinite(error.stated) else None
+            rows[f"{error.part}, estimated error, mm"] = stated
         flagged = metrics.values["flagged"].sum(axis=0)
         rows |= {f"frames with a flag, {p}": int(n) for p, n in zip(PARTS, flagged, strict=True)}
         if metrics.has_object:

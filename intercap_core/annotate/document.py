@@ -42,6 +42,10 @@ class Changed(UserError):
         super().__init__(f"{now.path}: was changed by another annotator; nothing was saved")
         self.now, self.difference = now, difference
 
+    def to_json(self) -> dict[str, Any]:
+        """Serialize for the page."""
+        return {"error": str(self), "now": self.now.to_json(), "difference": self.difference}
+
 
 @dataclass(frozen=True)
 class Document:
@@ -103,23 +107,10 @@ def patched(document: Document, changes: Mapping[str, Any]) -> str:
     unknown = sorted(set(changes) - set(Annotation.model_fields))
     if unknown:
         raise UserError(f"{document.path}: an annotation has no section {unknown[0]!r}")
-    stated = _stated(changes)
-    return with_changes(document, {k: stated[k] for k in Annotation.model_fields if k in stated})
-
-
-def sections_with(document: Document, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the file's sections with ``changes``, as in :func:`patched`."""
-    return _changed(document.sections, _stated(changes))
-
-
-def _stated(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace empty values by None, except in sections where an empty list has a meaning."""
-    return {k: None if v in ([], ()) and k not in STATED_EMPTY else v for k, v in changes.items()}
-
-
-def _changed(sections: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = {**sections, **changes}
-    return {k: v for k, v in merged.items() if v is not None or k not in changes}
+    ordered = {k: changes[k] for k in Annotation.model_fields if k in changes}
+    return with_changes(
+        document, {k: None if v == [] and k not in STATED_EMPTY else v for k, v in ordered.items()}
+    )
 
 
 def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
@@ -130,7 +121,8 @@ def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
     if document.problem:
         raise UserError(document.problem)
     text = document.text
-    wanted = _changed(document.sections, changes)
+    merged = {**document.sections, **changes}
+    wanted = {k: v for k, v in merged.items() if v is not None or k not in changes}
     try:
         for section, value in changes.items():
             text = replace_section(text, section, value)

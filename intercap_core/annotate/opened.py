@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import cv2
-import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.project import Project
-from intercap_core.schemas import FRAMES, SCENE
+from intercap_core.schemas import SCENE
 from intercap_core.stage_list import SEQUENCE_STAGES
 
 T = TypeVar("T")
+NO_FILE = "0"  # stamp of a missing file
 
 
 class Opened:
@@ -42,11 +43,11 @@ class Opened:
         self._cache: dict[str, tuple[tuple[str, ...], Any]] = {}
         self._making: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
         self._stack = contextlib.ExitStack()
-        self._images: tuple[str, Frames, Frames, np.ndarray] | None = None
+        self._images: tuple[str, tuple[Frames, Frames]] | None = None
 
     def stamp(self, *stages: str) -> str:
         """Return a text that changes if one of these artefacts, by default any, is replaced."""
-        return "-".join(_stamp(self.paths[stage]) for stage in stages or self.paths)
+        return "-".join(stamp_of(self.paths[stage]) for stage in stages or self.paths)
 
     def has(self, stage: str) -> bool:
         """Return whether the artefact of a stage exists."""
@@ -60,7 +61,7 @@ class Opened:
         with self.lock:
             making = self._making[key]
         with making:
-            stamps = tuple(_stamp(self.paths[stage]) for stage in stages)
+            stamps = tuple(stamp_of(self.paths[stage]) for stage in stages)
             known = self._cache.get(key)
             if known is None or known[0] != stamps:
                 known = stamps, make()
@@ -68,38 +69,26 @@ class Opened:
             return known[1]
 
     @contextlib.contextmanager
-    def images(self) -> Iterator[Frames]:
+    def images(self, *, by_set: bool = False) -> Iterator[Frames]:
         """Open the images, indexed by the frame that they show, or by set without a scene artefact.
 
         Raises UserError if the artefact of frames cannot be read.
+
+        Args:
+            by_set: index the images by set, as recorded.
         """
         with self.lock:
-            yield self._opened()[1]
-
-    @contextlib.contextmanager
-    def sets(self) -> Iterator[Frames]:
-        """Open the images by set, as recorded."""
-        with self.lock:
-            yield self._opened()[0]
-
-    def dropped(self) -> np.ndarray:
-        """Return the mask (T,) of the sets that the annotation dropped when stage frames ran."""
-        with self.lock:
-            return self._opened()[2]
-
-    def _opened(self) -> tuple[Frames, Frames, np.ndarray]:
-        stamp = self.stamp("frames", "scene")
-        if self._images is None or self._images[0] != stamp:
-            self.close()
-            file = self._stack.enter_context(artefacts.read(self.paths["frames"], FRAMES))
-            sets = shown = Frames(file)
-            with (
-                contextlib.suppress(artefacts.Unreadable),
-                artefacts.read(self.paths["scene"], SCENE) as scene,
-            ):
-                shown = sets.showing(scene["image_of"])
-            self._images = stamp, sets, shown, file["dropped"]
-        return self._images[1:]
+            stamp = self.stamp("frames", "scene")
+            if self._images is None or self._images[0] != stamp:
+                self.close()
+                sets = shown = self._stack.enter_context(Frames.open(self.paths["frames"]))
+                with (
+                    contextlib.suppress(artefacts.Unreadable),
+                    artefacts.read(self.paths["scene"], SCENE) as scene,
+                ):
+                    shown = sets.showing(scene["image_of"])
+                self._images = stamp, (shown, sets)
+            yield self._images[1][by_set]
 
     def close(self) -> None:
         """Close the files."""
@@ -108,11 +97,20 @@ class Opened:
             self._stack.close()
 
 
-def _stamp(path: Path) -> str:
+def object_of(project: Project, sequence: str) -> ObjectEntry:
+    """Return a sequence's object; raises UserError if it names none."""
+    entry = project.object_of(sequence)
+    if entry is None:
+        raise UserError(f"sequence {sequence!r} names no object")
+    return entry
+
+
+def stamp_of(path: Path) -> str:
+    """Return a text that changes if a file is replaced."""
     try:
         status = path.stat()
     except OSError:
-        return "0"
+        return NO_FILE
     return f"{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ino:x}"
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.solve.time_series import runs
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
-_MAX_BYTES = 1 << 22
+_MAX_BYTES = 1 << 22  # of the file of answers
+_UNSURE = ("unsure", "I cannot tell")  # choice
 
 
 def answers_path(annotation: Path) -> Path:
@@ -112,83 +113,75 @@ def _question(
     }  # fmt: skip
 
 
-def _ask_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_subject(opened: Opened, object_: str, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """Ask whether the chosen person is the subject, at the most confident image of the hips."""
     with artefacts.read(opened.paths["person"], PERSON) as person:
         doubts, by = str(person.attributes["doubts"]), str(person.attributes["chosen_by"])
         if by in ("alone", "named") and not doubts:
-            return []
+            return
         hips = person["keypoints"][:, :, KEYPOINT_NAMES.index("mid_hip")]  # (T, C, 3)
         t, c = np.unravel_index(int(hips[..., 2].argmax()), hips.shape[:2])
         x, y, confidence = hips[t, c]
         camera = person.text("camera_names")[c]
-    if not confidence > 0:
-        return []
-    why = f" ({doubts})" if doubts else ""
-    choices = (("yes", "Yes"), ("no", "No: I click the subject"))
-    return [
-        _question(
+    if confidence > 0:
+        why = f" ({doubts})" if doubts else ""
+        yield _question(
             "subject", "", 0, len(times) - 1, int(t),
-            f"Several people are visible. Is the marked person the subject?{why}",
-            len(times), choices, camera=camera, x=round(float(x), 1), y=round(float(y), 1),
-        )
-    ]  # fmt: skip
+            f"Several people are visible. Is the marked person the subject?{why}", len(times),
+            (("yes", "Yes"), ("no", "No: I click the subject")),
+            camera=camera, x=round(float(x), 1), y=round(float(y), 1),
+        )  # fmt: skip
 
 
-def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """Ask about doubtful left and right (:func:`.sides.doubts`)."""
-    return [
-        _question(
+    for doubt in doubts(opened):
+        yield _question(
             "sides", "", doubt.first, doubt.last, doubt.frame,
             "Are L and R in the views the subject's own left and right?",
             2.0 * (doubt.last - doubt.first + 1),
             (("yes", "Yes, in every view"), ("view", f"Swapped in {doubt.camera}"),
-             ("all", "Swapped in every view"), ("mark", "I mark where"),
-             ("unsure", "I cannot tell")),
+             ("all", "Swapped in every view"), ("mark", "I mark where"), _UNSURE),
             camera=doubt.camera, why=doubt.message,
-        )
-        for doubt in doubts(opened)
-    ]  # fmt: skip
+        )  # fmt: skip
 
 
-def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """Ask where the object is in lost frames, and whether ambiguous rotations are right."""
     if not object_:
-        return []
+        return
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
         lost, ambiguous = track["lost"], track["ambiguous"] & ~track["lost"]
-    questions = []
-    places = (("place", "I place it"), ("hidden", "It is not visible"))
     for first, last in runs(lost):
-        message = f"The {object_} is lost here. Where is it?"
-        questions.append(_question("lost", "", first, last, (first + last) // 2, message,
-                                   2.0 * (last - first + 1), places))  # fmt: skip
-    choices = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
+        yield _question(
+            "lost", "", first, last, (first + last) // 2,
+            f"The {object_} is lost here. Where is it?", 2.0 * (last - first + 1),
+            (("place", "I place it"), ("hidden", "It is not visible")),
+        )  # fmt: skip
     for first, last in runs(ambiguous):
-        message = f"Is the rotation of the {object_} as drawn?"
-        questions.append(_question("turn", "", first, last, (first + last) // 2, message,
-                                   3.0 + 1.5 * (last - first), choices))  # fmt: skip
-    return questions
+        yield _question(
+            "turn", "", first, last, (first + last) // 2,
+            f"Is the rotation of the {object_} as drawn?", 3.0 + 1.5 * (last - first),
+            (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), _UNSURE),
+        )  # fmt: skip
 
 
-def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> Iterator[dict[str, Any]]:
     """Ask about contact that is not annotated and whose probability is between 0.25 and 0.75."""
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         probability, labels = joint["contact_probability"], joint["contact_annotated"]
         regions = joint.text("region_names")
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    questions = []
     for r, region in enumerate(regions):
         p = probability[:, r]
-        uncertain = (p > 0.25) & (p < 0.75) & (labels[:, r] < 0)
-        for first, last in runs(uncertain):
+        for first, last in runs((p > 0.25) & (p < 0.75) & (labels[:, r] < 0)):
             if (last - first + 1) * step < 0.1:  # seconds; too short to matter
                 continue
             # weight: each frame counts 4 p (1 - p), which is 1 at p = 0.5 and 0 if p is certain
             run = p[first : last + 1]
-            frame = first + int(np.abs(run - 0.5).argmin())
-            message = f"Does the {region.replace('_', ' ')} touch the {object_} here?"
-            choices = (("yes", "It touches"), ("no", "It does not"), ("unsure", "I cannot tell"))
-            questions.append(_question("contact", region, first, last, frame, message,
-                                       float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
-    return questions
+            yield _question(
+                "contact", region, first, last, first + int(np.abs(run - 0.5).argmin()),
+                f"Does the {region.replace('_', ' ')} touch the {object_} here?",
+                float((4 * run * (1 - run)).sum()),
+                (("yes", "It touches"), ("no", "It does not"), _UNSURE),
+            )  # fmt: skip

@@ -98,7 +98,8 @@ class RunManager:
         self.cores, self.profile = cores, profile
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._sequence = ""
+        self.sequence = ""
+        """Sequence of the last run, "" if there was none."""
         self._expected: dict[str, float | None] = {}  # seconds by stage of the last run
         self._begun: dict[str, float] = {}  # time at which each stage was first seen at work
         self._start = self._ended = 0.0
@@ -109,11 +110,6 @@ class RunManager:
     def in_progress(self) -> bool:
         """True while a run that was started here has not ended."""
         return self._process is not None and self._process.poll() is None
-
-    @property
-    def sequence(self) -> str:
-        """Sequence of the last run, "" if there was none."""
-        return self._sequence
 
     def start(self, project: Project, sequence: str) -> None:
         """Back up the results of a sequence and compute its stale stages.
@@ -126,7 +122,7 @@ class RunManager:
         with self._lock:
             if self.in_progress:
                 raise UserError(
-                    f"a run of {self._sequence} is in progress; wait for its end, or stop it"
+                    f"a run of {self.sequence} is in progress; wait for its end, or stop it"
                 )
             stages = [stale["stage"] for stale in stale_stages(project, sequence)]
             if not stages:
@@ -137,7 +133,7 @@ class RunManager:
             Backup(project, sequence).make(stages)
             self._output = project.logs / "annotate.txt"  # not .log, which jobs use
             self._output.parent.mkdir(parents=True, exist_ok=True)
-            self._sequence, self._start, self._ended = sequence, time.time(), 0.0
+            self.sequence, self._start, self._ended = sequence, time.time(), 0.0
             self._stop_time = 0.0
             with open(self._output, "wb") as output:
                 self._process = subprocess.Popen(
@@ -187,7 +183,7 @@ class RunManager:
             lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()
             message = "\n".join(lines[-12:])
         return {
-            "state": state, "sequence": self._sequence, "stages": stages, "message": message,
+            "state": state, "sequence": self.sequence, "stages": stages, "message": message,
             "seconds": round((self._ended or time.time()) - self._start, 1),
             "ending_s": round(time.monotonic() - self._stop_time, 1) if stopping else 0.0,
             "ends_within_s": ENDS_WITHIN_S + _PATIENCE_S,
@@ -198,10 +194,10 @@ class RunManager:
             return
         self._ended = time.time()
         if self._process.returncode == 0:
-            Backup(project, self._sequence).mark_success()
+            Backup(project, self.sequence).mark_success()
 
     def _stage(self, project: Project, stage: str) -> dict[str, Any]:
-        log = project.logs / self._sequence / f"{stage}.log"
+        log = project.logs / self.sequence / f"{stage}.log"
         state, message = "waits", ""
         with contextlib.suppress(FileNotFoundError):
             if log.stat().st_mtime >= self._start - 1.0:  # some file systems store whole seconds

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.annotate.opened import Opened
+from intercap_core.annotate.opened import Opened, object_of
 from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
@@ -56,14 +56,19 @@ def describe(opened: Opened) -> dict[str, Any]:
                 "zup_from_master": np.eye(4)[:3].tolist(),
             }
             rig = images.rig
-        info["dropped"] = np.flatnonzero(opened.dropped()).tolist()
         broken: set[str] = set()
         for stage, (read, schema, key) in _READERS.items():
             if not opened.has(stage):
                 continue
             try:
-                _check_frames(opened, stage, schema, key, info["frames"])
-                rig = read(opened, info) or rig
+                with artefacts.read(opened.paths[stage], schema) as source:
+                    count = source.describe(key)[0][0]
+                    if count != info["frames"]:  # the images were read again
+                        raise UserError(
+                            f"{opened.paths[stage]}: has {count} frames, but {info['frames']} were "
+                            f"read since; it is not shown; re-run stage {stage!r}"
+                        )
+                    rig = read(opened, source, info) or rig
             except UserError as error:  # another version, damaged, or of another recording
                 info["notes"].append(str(error))
                 broken.add(stage)
@@ -138,9 +143,7 @@ def object_payload(opened: Opened) -> str:
 
     Raises UserError if the sequence has no object.
     """
-    entry = opened.project.object_of(opened.name)
-    if entry is None:
-        raise UserError(f"sequence {opened.name!r} names no object")
+    entry = object_of(opened.project, opened.name)
 
     def make() -> str:
         mesh = ObjectMesh.load(entry)
@@ -162,122 +165,84 @@ def object_payload(opened: Opened) -> str:
     return opened.cached("object", ("joint", "object_track"), make)
 
 
-def _check_frames(
-    opened: Opened, stage: str, schema: artefacts.Schema, key: str, frames: int
-) -> None:
-    """Raise UserError if an artefact has another number of frames than the images.
-
-    This happens if the images were read again and the stage was not run. ``key`` is a dataset of
-    the stage with a row per frame.
-    """
-    with artefacts.read(opened.paths[stage], schema) as source:
-        count = source.describe(key)[0][0]
-    if count != frames:
-        raise UserError(
-            f"{opened.paths[stage]}: has {count} frames, but {frames} were read since; it is not "
-            f"shown; re-run stage {stage!r}"
-        )
+_Info = dict[str, Any]
 
 
-def _scene(opened: Opened, info: dict[str, Any]) -> Rig:
+def _scene(opened: Opened, scene: artefacts.Artefact, info: _Info) -> Rig:
     """Add transforms, image assignment and floor; returns the refined cameras."""
-    with artefacts.read(opened.paths["scene"], SCENE) as scene:
-        info["zup_from_master"] = scene["zup_from_master"][:3].tolist()
-        info["image_of"] = scene["image_of"].T.tolist()
-        point, normal = scene["ground_point"], scene["ground_normal"]
-        if np.isfinite(point).all():
-            info["ground"] = {"point": point.tolist(), "normal": normal.tolist()}
-        return Rig.from_artefact(scene)
+    info["zup_from_master"] = scene["zup_from_master"][:3].tolist()
+    info["image_of"] = scene["image_of"].T.tolist()
+    point, normal = scene["ground_point"], scene["ground_normal"]
+    if np.isfinite(point).all():
+        info["ground"] = {"point": point.tolist(), "normal": normal.tolist()}
+    return Rig.from_artefact(scene)
 
 
-def _person(opened: Opened, info: dict[str, Any]) -> None:
+def _person(opened: Opened, person: artefacts.Artefact, info: _Info) -> None:
     """Add the choice of the subject, and places without the subject or with doubtful sides."""
-    with artefacts.read(opened.paths["person"], PERSON) as person:
-        info["subject"] = {
-            "chosen_by": str(person.attributes["chosen_by"]),
-            "doubts": str(person.attributes["doubts"]),
-            "others": int(person["others"].max(initial=0)),
-        }
-        missing = person["missing"]
-    info["places"] += _runs(missing, "subject", "fewer than two views see the subject", 1.0)
+    info["subject"] = {key: str(person.attributes[key]) for key in ("chosen_by", "doubts")}
+    message = "fewer than two views see the subject"
+    info["places"] += _runs(person["missing"], "subject", message, 1.0)
     info["places"] += [
         _place(doubt.first, doubt.last, "sides", doubt.message, 2.0, doubt.frame)
         for doubt in doubts(opened)
     ]
 
 
-def _track(opened: Opened, info: dict[str, Any]) -> None:
-    """Add the object's track, and places with a lost object or an ambiguous rotation."""
-    with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
-        info["track"] = {
-            "object": str(track.attributes["object"]),
-            "source": str(track.attributes["seed_source"]),
-            "seed": int(track.attributes["seed_frame"]),
-            "doubts": str(track.attributes["doubts"]),
-            "lost": np.flatnonzero(track["lost"]).tolist(),
-            "ambiguous": np.flatnonzero(track["ambiguous"]).tolist(),
-            "probability": _bytes(track["probability"]),
-        }
-        if not info["track"]["object"]:
-            return
-        info["places"] += _runs(track["lost"], "object", _LOST, 3.0)
+def _track(opened: Opened, track: artefacts.Artefact, info: _Info) -> None:
+    """Add doubts about the track, and places with a lost object or an ambiguous rotation."""
+    lost = track["lost"]
+    info["track"] = {
+        "doubts": str(track.attributes["doubts"]), "lost": np.flatnonzero(lost).tolist()
+    }  # fmt: skip
+    if track.attributes["object"]:
+        info["places"] += _runs(lost, "object", _LOST, 3.0)
         message = "the rotation of the object is ambiguous"
         info["places"] += _runs(track["ambiguous"], "object", message, 2.0)
 
 
-def _body(opened: Opened, info: dict[str, Any]) -> None:
+def _body(opened: Opened, fit: artefacts.Artefact, info: _Info) -> None:
     """Add places in which the body fit failed."""
-    with artefacts.read(opened.paths["body_fit"], BODY_FIT) as fit:
-        failed = fit["failed"]
-    info["places"] += _runs(failed, "body", "the body fit failed", 2.5)
+    info["places"] += _runs(fit["failed"], "body", "the body fit failed", 2.5)
 
 
-def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
-    """Add contact and flags of the joint fit; returns its cameras, None without a scene."""
-    with artefacts.read(opened.paths["joint"], JOINT) as joint:
-        probability = joint["contact_probability"]
-        if np.isfinite(probability).any():
-            info["contact"] = {
-                "regions": joint.text("region_names"),
-                "probability": _bytes(probability),
-                "annotated": bool((joint["contact_annotated"] >= 0).any()),
-            }
-        info["flags"] = ranges(Flags.read(joint).texts())
-        moved = joint["master_from_colour"]
+def _joint(opened: Opened, joint: artefacts.Artefact, info: _Info) -> Rig | None:
+    """Add contact; returns the cameras of the joint fit, None without a scene."""
+    probability = joint["contact_probability"]
+    if np.isfinite(probability).any():
+        info["contact"] = {
+            "regions": joint.text("region_names"), "probability": _bytes(probability)
+        }  # fmt: skip
     if opened.has("scene"):
-        return Rig.from_scene(opened.paths["scene"]).moved(moved)
+        return Rig.from_scene(opened.paths["scene"]).moved(joint["master_from_colour"])
     return None
 
 
-def _metrics(opened: Opened, info: dict[str, Any]) -> None:
-    """Add flags and stated errors, and places with flags or large stated errors."""
-    with artefacts.read(opened.paths["metrics"], METRICS) as metrics:
-        info["flags"] = ranges(Flags.read(metrics).texts())
-        if "verdict/error" in metrics:
-            parts = metrics.text("verdict/part_names")
-            error, by_frame = metrics["verdict/error"], metrics["verdict/error_frame"]
-            silent = metrics.text("verdict/silent")
-            info["verdict"] = [
-                {
-                    "part": part,
-                    "mm": None if not np.isfinite(error[p]) else round(1e3 * float(error[p]), 1),
-                    "silent": silent[p],
-                    "by_frame": [None if not np.isfinite(e) else round(1e3 * float(e), 1)
-                                 for e in by_frame[p]],
-                }
-                for p, part in enumerate(parts)
-            ]  # fmt: skip
-            for p, part in enumerate(parts):
-                info["places"] += _doubtful(part, float(error[p]), by_frame[p])
+def _metrics(opened: Opened, metrics: artefacts.Artefact, info: _Info) -> None:
+    """Add stated errors, and places with flags or large stated errors."""
+    if "verdict/error" in metrics:
+        parts = metrics.text("verdict/part_names")
+        error, by_frame = metrics["verdict/error"], metrics["verdict/error_frame"]
+        silent = metrics.text("verdict/silent")
+        info["verdict"] = [
+            {
+                "part": part,
+                "mm": None if not np.isfinite(error[p]) else round(1e3 * float(error[p]), 1),
+                "silent": silent[p],
+            }
+            for p, part in enumerate(parts)
+        ]
+        for p, part in enumerate(parts):
+            info["places"] += _doubtful(part, float(error[p]), by_frame[p])
     lost = set(info.get("track", {}).get("lost", ()))
     info["places"] = [place for place in info["places"] if place["message"] != _LOST]  # are flagged
-    for first, last, reason in info["flags"]:
+    for first, last, reason in ranges(Flags.read(metrics).texts()):
         weight = 3.0 if lost.intersection(range(first, last + 1)) else 1.5
         info["places"].append(_place(first, last, "flag", f"not reliable: {reason}", weight))
 
 
 _LOST = "the object is lost"
-_Reader = Callable[[Opened, dict[str, Any]], Rig | None]
+_Reader = Callable[[Opened, Any, _Info], Rig | None]
 # Reader of each stage, schema, and a dataset with a row per frame
 _READERS: dict[str, tuple[_Reader, artefacts.Schema, str]] = {
     "scene": (_scene, SCENE, "times"),

@@ -12,12 +12,13 @@ import base64
 import json
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -26,6 +27,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from intercap_core.annotate import document, result, sides
@@ -35,12 +37,11 @@ from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
-_CACHED = {
-    "cache-control": "private, max-age=86400, immutable"
-}  # for addresses that contain a stamp
+# Headers of addresses that contain a stamp
+_CACHED = {"cache-control": "private, max-age=86400, immutable"}
 
 
-def application(annotator: Annotator, token: str) -> App:
+def application(annotator: Annotator, token: str) -> ASGIApp:
     """Return the server of a project; every request under /api/ must carry the ``token``."""
 
     def page(_: Request) -> Response:
@@ -74,8 +75,6 @@ def application(annotator: Annotator, token: str) -> App:
 
     def change(function: Callable[[str, dict[str, Any]], Any]) -> Callable[..., Any]:
         async def endpoint(request: Request) -> Response:
-            from starlette.concurrency import run_in_threadpool
-
             name = request.path_params["name"]
             annotator.opened(name)
             try:
@@ -114,7 +113,7 @@ def application(annotator: Annotator, token: str) -> App:
         ),
     ]
     handlers: Any = {
-        document.Changed: _changed,
+        document.Changed: lambda _, error: _json(error.to_json(), 409),
         UserError: lambda _, error: _json({"error": str(error)}, 422),
         HTTPException: lambda _, error: _json({"error": error.detail}, error.status_code),
         KeyError: lambda _, error: _json({"error": f"{error} is missing"}, 400),
@@ -123,11 +122,6 @@ def application(annotator: Annotator, token: str) -> App:
         Exception: lambda _, error: _json({"error": f"unexpected {type(error).__name__}"}, 500),
     }
     return Guard(Starlette(routes=routes, exception_handlers=handlers), token)
-
-
-def _changed(_: Request, error: Any) -> Response:
-    content = {"error": str(error), "now": error.now.to_json()}
-    return _json(content | {"difference": error.difference}, 409)
 
 
 def _json(value: Any, status: int = 200) -> Response:
@@ -149,17 +143,12 @@ _HEADERS = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cross-origin-opener-policy", b"same-origin"),
 )
-Scope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class Guard:
     """Refuse requests that do not come from the page; add security headers to responses."""
 
-    def __init__(self, app: App, token: str) -> None:
+    def __init__(self, app: ASGIApp, token: str) -> None:
         self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -175,11 +164,8 @@ class Guard:
             await send(message)
 
         fault = refusal(scope["method"], scope["path"], Headers(scope=scope), self._token)
-        answer: App = self._app
-        if fault is not None:
-            status, reason = fault
-            answer = PlainTextResponse(f"{reason}\n", status)
-        await answer(scope, receive, sent)
+        refused = None if fault is None else PlainTextResponse(f"{fault[1]}\n", fault[0])
+        await (refused or self._app)(scope, receive, sent)
 
 
 def refusal(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -45,8 +46,6 @@ class Sides:
     """(T, C, 2) whether stage person exchanged arms and legs: 1 yes, 0 no, -1 not visible."""
     result: np.ndarray
     """(T, 14, 3) limbs of the result, master frame, metres; NaN = none."""
-    source: str
-    """Stage of ``result``."""
     against: np.ndarray
     """(T,) negative log likelihood of the body's build minus that of the best exchange of arms,
     legs and head, >= 0; 0 = no exchange suits the build better."""
@@ -82,14 +81,8 @@ def sides_payload(opened: Opened) -> str:
 
     def make() -> str:
         sides = sides_of(opened)
-        header = {"cameras": sides.cameras, "bones": [list(b) for b in BONES],
-                  "points": list(POINTS), "source": sides.source}  # fmt: skip
-        arrays: dict[str, np.ndarray] = {
-            "detected": sides.detected,
-            "exchanged": np.any(sides.exchanged > 0, axis=2).astype(np.uint8),
-            "result": sides.result.astype(np.float32),
-        }
-        return payload(header, arrays)
+        arrays = {"detected": sides.detected, "result": sides.result.astype(np.float32)}
+        return payload({"cameras": sides.cameras, "bones": BONES}, arrays)
 
     return opened.cached("sides payload", _STAGES, make)
 
@@ -111,7 +104,7 @@ def doubts(opened: Opened) -> list[Doubt]:
             annotation.left_right, sides.cameras, sides.image_of, opened.name
         )
     limbs = np.where(sides.exchanged < 0, -1, sides.exchanged ^ stated[..., None])
-    return _runs(limbs, sides)
+    return list(_runs(limbs, sides))
 
 
 def _sides(opened: Opened) -> Sides:
@@ -135,9 +128,9 @@ def _sides(opened: Opened) -> Sides:
     limbs = np.stack([_exchanged(given, used, limb, confident) for limb in (ARMS, LEGS)], 2)
     points = given[:, :, _KEYPOINTS]
     pixels = np.where(points[..., 2:] >= confident, np.rint(points[..., :2]), -1)
-    source, result, jumped = _result(opened, joints)
+    result, jumped = _result(opened, joints)
     return Sides(
-        cameras, np.clip(pixels, -1, 32767).astype(np.int16), limbs, result, source,
+        cameras, np.clip(pixels, -1, 32767).astype(np.int16), limbs, result,
         excess_build_cost(joints.astype(np.float64)), jumped, image_of,
     )  # fmt: skip
 
@@ -152,8 +145,8 @@ def _exchanged(
     return np.where(visible, exchanged.astype(int), -1)
 
 
-def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return stage, limbs (T, 14, 3) and frames with jumps (T,) of the most refined result."""
+def _result(opened: Opened, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return limbs (T, 14, 3) and frames with jumps (T,) of the most refined result."""
     for stage, schema in (("joint", JOINT), ("body_fit", BODY_FIT)):
         try:
             with artefacts.read(opened.paths[stage], schema) as body:
@@ -161,11 +154,11 @@ def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.nda
         except artefacts.Unreadable:
             continue
         if len(refined) == len(joints):
-            return stage, refined[:, _JOINTS], np.any(list(exchanged(refined).values()), 0)
-    return "person", joints[:, _KEYPOINTS], np.zeros(len(joints), bool)
+            return refined[:, _JOINTS], np.any(list(exchanged(refined).values()), 0)
+    return joints[:, _KEYPOINTS], np.zeros(len(joints), bool)
 
 
-def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
+def _runs(limbs: np.ndarray, sides: Sides) -> Iterator[Doubt]:
     """Return runs of doubtful frames; ``limbs`` (T, C, 2) as :attr:`Sides.exchanged`."""
     against, jumped = sides.against, sides.jumped
     visible = (limbs >= 0).sum(1)
@@ -175,7 +168,6 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
     for before, after in pairwise(np.flatnonzero(doubtful).tolist()):
         if after - before <= 4:  # at most three frames between are part of the run
             doubtful[before:after] = True
-    found = []
     for first, last in runs(doubtful):
         run = slice(first, last + 1)
         why = []
@@ -189,5 +181,4 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
         worst = first + int((against[run] + 3.0 * share[run].max(1)).argmax())
         most = int((limbs[run] > 0).sum((0, 2)).argmax())
         message = f"left and right: {'; '.join(why)}"
-        found.append(Doubt(first, last, worst, sides.cameras[most], message))
-    return found
+        yield Doubt(first, last, worst, sides.cameras[most], message)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
+from intercap_core.annotation import ObjectPose
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
@@ -29,14 +30,8 @@ from intercap_core.schemas import SCENE
 NEEDED = ("frames", "detections", "scene", "person")
 
 
-def snap(
-    opened: Opened,
-    entry: ObjectEntry,
-    frame: int,
-    rotation_vector: list[float],
-    translation: list[float],
-) -> dict[str, Any]:
-    """Fit the pose of a frame to depth and masks of all views, from this start.
+def snap(opened: Opened, entry: ObjectEntry, pose: ObjectPose) -> dict[str, Any]:
+    """Fit the object's pose in a frame to depth and masks of all views, from this start.
 
     Returns, for JSON:
         ``rotation_vector``, ``translation``: master_from_object, radians and metres.
@@ -50,8 +45,9 @@ def snap(
     if missing:
         raise UserError(f"a fit to the images needs stage {missing[0]!r}; run it first")
     settings = opened.project.config.object_track
-    start = rigid(Rotation.from_rotvec(rotation_vector).as_matrix(), np.array(translation))
-    with opened.sets() as images:
+    rotation = Rotation.from_rotvec(pose.rotation_vector).as_matrix()
+    start = rigid(rotation, np.array(pose.translation))
+    with opened.images(by_set=True) as images:
         mesh = opened.cached("mesh", (), lambda: ObjectMesh.load(entry).simplified(TRACKING_FACES))
         detected = opened.cached(
             "detections", ("detections",), lambda: Detections.load(opened.paths["detections"])
@@ -63,7 +59,7 @@ def snap(
                 images, detected, opened.paths["scene"], opened.paths["person"], mesh.diameter
             ),
         )
-        views = source.views(frame)
+        views = source.views(pose.frame)
     fit = _fitted(mesh, views, start, settings, entry.labels)
     turned = Rotation.from_matrix(fit.pose[:3, :3] @ start[:3, :3].T).magnitude()
     middle = mesh.centre_at(fit.pose) - mesh.centre_at(start)
