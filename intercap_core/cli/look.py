@@ -201,7 +201,19 @@ def keypoint_definition(
 
     Example: intercap keypoint-definition lab/config.yaml lab/detector.tsv
     """
-    prepare()
-    from intercap_core.commands.definition import learn_definition
+    project = open_project(settings)
+    import numpy as np
 
-    typer.echo(learn_definition(settings, output))
+    from intercap_core.body_fit.definition import average_offsets
+
+    fits = [project.artefact(name, "body_fit") for name in project.sequences]
+    definition, people = average_offsets([path for path in fits if path.is_file()])
+    names = ", ".join(people)
+    definition.write(output, f"{project.config.dataset}, {len(people)} people: {names}")
+    offset = 1e3 * np.linalg.norm(definition.offsets, axis=1)
+    typer.echo(
+        f"{output}: learned from {len(people)} people; the keypoints are {offset.mean():.0f} mm "
+        f"from the body model's on average, at most {offset.max():.0f} mm, with a standard "
+        f"deviation of {1e3 * definition.sigma.mean():.0f} mm; set "
+        "body_fit.keypoint_definition to this file"
+    )

@@ -21,14 +21,8 @@ from intercap_core.cli.options import (
 app = typer.Typer()
 
 
-class ReleasedKind(StrEnum):
-    """Kinds of files that `intercap release` lists."""
-
-    card = "card"
-    tables = "tables"
-    site = "site"
-    export = "export"
-    artefact = "artefact"
+ReleasedKind = StrEnum("ReleasedKind", ["card", "tables", "site", "export", "artefact"])
+"""Kinds of files that `intercap release` lists."""
 
 
 @app.command()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from intercap_core.commands.console import ListTable, standard_console
@@ -22,24 +21,16 @@ _COLOURS = {GOOD: "green", NOTE: "yellow", BAD: "red"}
 _SHARED = ("nfs", "nfs4", "lustre", "gpfs", "beegfs", "ceph", "cifs", "smb3", "fuse.glusterfs")
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line of the table."""
-
-    what: str
-    """What was checked."""
-    state: str
-    """``GOOD``, ``NOTE`` or ``BAD``."""
-    words: str
-    """What was found."""
+Finding = tuple[str, str, str]
+"""What was checked; ``GOOD``, ``NOTE`` or ``BAD``; what was found."""
 
 
 def findings(project: Project | None) -> Iterator[Finding]:
     """Check the machine; with a ``project`` also its body files, disk and locks."""
     for name, version in versions():
-        yield Finding(name, GOOD, version)
+        yield name, GOOD, version
     deciding = ", ".join(f"{name} {version}" for name, version in library_versions().items())
-    yield Finding("numerical libraries", GOOD, f"{deciding}; {processor()}, {os.cpu_count()} cores")
+    yield "numerical libraries", GOOD, f"{deciding}; {processor()}, {os.cpu_count()} cores"
     yield _gpu(project)
     if project is not None:
         yield _bodies(project)
@@ -54,10 +45,9 @@ def print_findings(project: Project | None) -> bool:
     """Print all findings as a table; True if none is a problem."""
     table = ListTable(show_header=False)
     good = True
-    for finding in findings(project):
-        colour = _COLOURS[finding.state]
-        table.add_row(finding.what, f"[{colour}]{finding.state}[/{colour}]", finding.words)
-        good &= finding.state != BAD
+    for what, state, text in findings(project):
+        table.add_row(what, f"[{_COLOURS[state]}]{state}[/{_COLOURS[state]}]", text)
+        good &= state != BAD
     standard_console().print(table)
     return good
 
@@ -73,12 +63,10 @@ def _gpu(project: Project | None) -> Finding:
         found = False
     if found:
         words = "" if wanted or project is None else "; the settings run detectors on the CPU"
-        return Finding("GPU", GOOD, f"onnxruntime has CUDA{words}")
+        return "GPU", GOOD, f"onnxruntime has CUDA{words}"
     if wanted:
-        return Finding(
-            "GPU", BAD, "the settings run detectors on a GPU, but onnxruntime finds no CUDA"
-        )
-    return Finding("GPU", GOOD, "none found, none needed")
+        return "GPU", BAD, "the settings run detectors on a GPU, but onnxruntime finds no CUDA"
+    return "GPU", GOOD, "none found, none needed"
 
 
 def _bodies(project: Project) -> Finding:
@@ -87,9 +75,9 @@ def _bodies(project: Project) -> Finding:
     try:
         check_bodies(project)
     except UserError as error:
-        return Finding("body files", BAD, str(error))
+        return "body files", BAD, str(error)
     named = [path.name for _, path in project.config.body_models if isinstance(path, Path)]
-    return Finding("body files", GOOD, ", ".join(named) or "the open body")
+    return "body files", GOOD, ", ".join(named) or "the open body"
 
 
 def _disk(project: Project) -> Iterator[Finding]:
@@ -100,9 +88,9 @@ def _disk(project: Project) -> Iterator[Finding]:
         f"expected{usage.basis}, {usage.free / 1e9:.1f} GB are free"
     )
     enough = usage.free >= 1.2 * usage.missing  # margin of the estimate
-    yield Finding("disk", GOOD if enough else BAD, words)
+    yield "disk", GOOD if enough else BAD, words
     share = 100 * usage.per_output["frames"] / max(sum(usage.per_output.values()), 1)
-    yield Finding(
+    yield (
         "disk", NOTE,
         f"frames.h5 ({share:.0f} % of a sequence) can be deleted when a dataset is done; a later "
         "run writes it again",
@@ -125,35 +113,35 @@ def _file_system(results: Path) -> Finding:
     words = f"{place} is on {kind}"
     if not shared:
         words += ", which other machines may not see; a cluster needs a shared file system"
-    return Finding("file system", GOOD if shared else NOTE, words)
+    return "file system", GOOD if shared else NOTE, words
 
 
 def _locks(project: Project) -> Finding:
     owner = lease_holder(project.results / "run")
     if owner is not None:
-        return Finding("locks", NOTE, f"a run is active: {owner}")
+        return "locks", NOTE, f"a run is active: {owner}"
     if any((project.root / ".snakemake/locks").glob("*")):
-        return Finding(
+        return (
             "locks", NOTE,
             "there is a lock of Snakemake; `intercap run` removes it if its own run was killed; "
             "otherwise run `intercap run SETTINGS -- --unlock` when no run is active",
         )  # fmt: skip
-    return Finding("locks", GOOD, "none")
+    return "locks", GOOD, "none"
 
 
 def _scheduler() -> Finding:
     slurm = shutil.which("sbatch")
     if slurm is None:
-        return Finding("scheduler", GOOD, "no Slurm; runs use this machine's cores")
+        return "scheduler", GOOD, "no Slurm; runs use this machine's cores"
     try:
         import snakemake_executor_plugin_slurm as plugin
     except ImportError:
-        return Finding(
+        return (
             "scheduler", NOTE,
             f"{slurm}, but Snakemake's plugin for it is not installed: pip install "
             "'intercap-core[workflow]'",
         )  # fmt: skip
-    return Finding("scheduler", GOOD, f"{slurm}, with {plugin.__name__}; see docs/cluster.md")
+    return "scheduler", GOOD, f"{slurm}, with {plugin.__name__}; see docs/cluster.md"
 
 
 def _browser() -> Finding:
@@ -163,5 +151,5 @@ def _browser() -> Finding:
     try:
         program = next(filter(None, map(shutil.which, programs)), None) or webbrowser.get().name
     except webbrowser.Error:
-        return Finding("browser", NOTE, "none; copy the site's folder to a machine with a browser")
-    return Finding("browser", GOOD, str(program))
+        return "browser", NOTE, "none; copy the site's folder to a machine with a browser"
+    return "browser", GOOD, str(program)

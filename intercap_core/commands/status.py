@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,12 +14,13 @@ from intercap_core.commands.console import ListTable, counted, standard_console
 from intercap_core.inputs.files import name_some, printable
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
-from intercap_core.pipeline.plan import OutputState, OutputStatus, Plan
+from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
 ROWS = 40  # printed sequences that are not done
 DONE, RUNNING, FAILED, STALE, MISSING = "done", "running", "failed", "out of date", "missing"
+_STATES = {OutputStatus.done: DONE, OutputStatus.missing: MISSING, OutputStatus.stale: STALE}
 WAITING = "waits"  # for an artefact that the stage reads and that is not done
 _MARKS = {
     DONE: "[green]✓[/green]", RUNNING: "[yellow]▶[/yellow]", FAILED: "[red]✗[/red]",
@@ -36,7 +37,7 @@ class StageStatus:
 
     state: str
     """``DONE``, ``RUNNING``, ``FAILED``, ``STALE``, ``MISSING`` or ``WAITING``."""
-    words: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
     """Reasons of a stale or failed output, or the process that is computing it."""
     made_on: str = ""
     """Device and processor that computed the output; "" if they are those of this machine."""
@@ -63,40 +64,26 @@ def status(project: Project) -> Status:
     """Determine the state of every output from its manifest, log and lease."""
     plan = Plan(project)
     sequences = {name: _of_sequence(project, plan, name) for name in project.sequences}
-    dataset = plan.dataset
-    words = {OutputStatus.done: DONE, OutputStatus.missing: MISSING, OutputStatus.stale: STALE}[
-        dataset.status
-    ]
-    return Status(sequences, StageStatus(words, dataset.reasons))
+    dataset = StageStatus(_STATES[plan.dataset.status], plan.dataset.reasons)
+    return Status(sequences, dataset)
 
 
 def _of_sequence(project: Project, plan: Plan, name: str) -> dict[str, StageStatus]:
-    states = plan.states(name)
     outputs: dict[str, StageStatus] = {}
-    for stage, state in states.items():
-        output = plan.output(name, stage)
-        owner = lease_holder(output)
-        if owner is not None:
+    for stage, state in plan.states(name).items():
+        log = project.logs / name / f"{stage}.log"
+        reads = STAGES[stage].reads if stage in STAGES else ()
+        if (owner := lease_holder(plan.output(name, stage))) is not None:
             outputs[stage] = StageStatus(RUNNING, (str(owner),))
         elif state.status is OutputStatus.done:
             outputs[stage] = StageStatus(DONE, (), state.made_on)
+        elif log.is_file() and (end := read_state(log))[0] == "failed":
+            outputs[stage] = StageStatus(FAILED, (end[1],))
+        elif any(outputs[other].state != DONE for other in reads if other in outputs):
+            outputs[stage] = StageStatus(WAITING)
         else:
-            outputs[stage] = _not_done(project, name, stage, state, outputs)
+            outputs[stage] = StageStatus(_STATES[state.status], state.reasons)
     return outputs
-
-
-def _not_done(
-    project: Project, name: str, stage: str, state: OutputState, outputs: Mapping[str, StageStatus]
-) -> StageStatus:
-    log = project.logs / name / f"{stage}.log"
-    if log.is_file():
-        ended, words = read_state(log)
-        if ended == "failed":
-            return StageStatus(FAILED, (words,))
-    reads = STAGES[stage].reads if stage in STAGES else ()
-    if any(outputs[other].state != DONE for other in reads if other in outputs):
-        return StageStatus(WAITING)
-    return StageStatus(STALE if state.status is OutputStatus.stale else MISSING, state.reasons)
 
 
 def print_status(project: Project, *, every: bool = False, as_json: bool = False) -> None:
@@ -125,7 +112,7 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
     for line in _reasons(current):
         print(line)
     if current.dataset.state != DONE:
-        why = f": {'; '.join(current.dataset.words)}" if current.dataset.words else ""
+        why = f": {'; '.join(current.dataset.reasons)}" if current.dataset.reasons else ""
         label = _LABELS[current.dataset.state]
         print(f"the site's first page, tables and card are {label}{why}")
     for machine, count in _other_machines(current).items():
@@ -152,7 +139,7 @@ def _reasons(current: Status) -> list[str]:
     for name, stages in current.sequences.items():
         for stage, output in stages.items():
             if output.state in (FAILED, STALE, RUNNING):
-                for words in output.words:
+                for words in output.reasons:
                     sequences.setdefault((output.state, stage, words), []).append(name)
     lines = []
     order = (FAILED, STALE, RUNNING)
@@ -174,20 +161,15 @@ def _other_machines(current: Status) -> Counter[str]:
 
 
 def _to_json(current: Status) -> dict[str, object]:
-    def entry(output: StageStatus) -> dict[str, object]:
-        return {
-            "state": output.state, "reasons": list(output.words), "made_on": output.made_on
-        }  # fmt: skip
-
     return {
         "sequences": {
             name: {
                 "state": current.of(name),
-                "stages": {stage: entry(output) for stage, output in stages.items()},
+                "stages": {stage: asdict(output) for stage, output in stages.items()},
             }
             for name, stages in current.sequences.items()
         },
-        "dataset": entry(current.dataset),
+        "dataset": asdict(current.dataset),
     }
 
 

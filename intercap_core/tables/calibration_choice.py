@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 
@@ -17,19 +16,9 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
 
 
-@dataclass(frozen=True)
-class CalibrationChoice:
-    """Result of :func:`choose_calibration`."""
-
-    best: str | None
-    """Name of the calibration whose residual is clearly the smallest; None if there is none."""
-    residual_m: dict[str, float]
-    """Residual of each calibration that could be compared, metres."""
-
-
 def choose_calibration(
     sequence: SequenceEntry, calibrations: Mapping[str, Path]
-) -> CalibrationChoice:
+) -> tuple[str | None, dict[str, float]]:
     """Compare the calibration folders on the background depth of one recording.
 
     Only pairs of cameras to which two calibrations give different relative poses are compared. One
@@ -37,6 +26,10 @@ def choose_calibration(
     difference of its depth from the depth that the other camera measured there. The residual is
     the median error, averaged over the pairs. The best residual must be at most 90 % of the next.
     Calibrations and cameras that cannot be read are left out.
+
+    Returns:
+        The name of the calibration whose residual is clearly the smallest, None if there is none;
+        and the residual of each calibration that could be compared, metres.
     """
     rigs: dict[str, dict[str, Camera]] = {}
     depths: dict[str, np.ndarray] = {}
@@ -57,7 +50,7 @@ def choose_calibration(
             residuals[name] = float(np.nanmean(distances))
     order = sorted(residuals, key=lambda name: residuals[name])
     decided = len(order) > 1 and residuals[order[0]] <= 0.9 * residuals[order[1]]
-    return CalibrationChoice(order[0] if decided else None, residuals)
+    return order[0] if decided else None, residuals
 
 
 def _cameras(row: SequenceEntry, depths: dict[str, np.ndarray]) -> dict[str, Camera]:

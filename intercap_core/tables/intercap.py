@@ -185,12 +185,12 @@ def _calibration(key: Key, folder: Path, known: dict[str, Path], row: Row) -> Pa
         recordings=folder,
         calibration=folder,
     )
-    choice = choose_calibration(entry, known)
-    measured = ", ".join(f"{n} {1000 * r:.1f} mm" for n, r in choice.residual_m.items())
+    best, residuals = choose_calibration(entry, known)
+    measured = ", ".join(f"{n} {1000 * r:.1f} mm" for n, r in residuals.items())
     measured = f"residual of the background depth: {measured or 'not measured'}"
     # The unstated recordings lie between those of the first and those of the third calibration.
-    name = choice.best or ("third" if "third" in known else next(iter(known)))
-    why = "the best" if choice.best else "a guess, none is clearly the best"
+    name = best or ("third" if "third" in known else next(iter(known)))
+    why = "the best" if best else "a guess, none is clearly the best"
     row.remarks.append(f"the release does not state this calibration; {name} is {why} ({measured})")
     return known[name]
 
@@ -206,16 +206,16 @@ def _annotate(
     """Convert a sequence's annotations; the row names the first, others become alternatives."""
     name = row.columns["sequence"]
     for index, folder in enumerate(folders):
-        converted = convert(folder, numbers, with_pose=with_pose)
-        row.remarks += [f"{folder.name}: {fault}" for fault in converted.faults]
-        if not converted.text:
+        text, faults = convert(folder, numbers, with_pose=with_pose)
+        row.remarks += [f"{folder.name}: {fault}" for fault in faults]
+        if not text:
             continue
         if "annotation" not in row.columns:
             row.columns["annotation"] = f"annotations/{name}.yaml"
-            result.annotations[f"{name}.yaml"] = converted.text
+            result.annotations[f"{name}.yaml"] = text
             continue
         other = f"alternatives/{name}_{index}.yaml"
-        result.annotations[other] = converted.text
+        result.annotations[other] = text
         row.remarks.append(f"{folder.name} annotates this sequence as well: annotations/{other}")
 
 

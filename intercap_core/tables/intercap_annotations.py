@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import configparser
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +25,6 @@ FOLDER = re.compile(
 Key = tuple[int, int, int]  # subject, object, segment
 
 
-@dataclass
-class Converted:
-    """Result of :func:`convert`."""
-
-    text: str
-    """The annotation as YAML; "" if nothing can be used."""
-    faults: list[str] = field(default_factory=list)
-    """Parts that were left out, with the reason."""
-
-
 def find_annotation_folders(root: Path) -> dict[Key, list[Path]]:
     """Folders by sequence; those whose name ends with the segment come first, then by name."""
     folders: dict[Key, list[tuple[str, Path]]] = {}
@@ -47,10 +36,11 @@ def find_annotation_folders(root: Path) -> dict[Key, list[Path]]:
     return {key: [path for _, path in sorted(paths)] for key, paths in folders.items()}
 
 
-def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
+def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> tuple[str, list[str]]:
     """Convert a folder's files to an annotation of the frame sets of one recording.
 
-    Parts that cannot be read are left out and reported as faults.
+    Returns the annotation as YAML, "" if nothing can be used, and the parts that cannot be read and
+    are left out, with the reason.
 
     Args:
         folder: folder of one sequence.
@@ -73,9 +63,9 @@ def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
         faults.append(f"{field}: {text}")
         sections.pop(field.partition(".")[0], None)
     if not sections:
-        return Converted("", faults)
+        return "", faults
     head = f"# From {folder.name} of the release. Frames are frame sets, from 0.\n"
-    return Converted(head + dump_yaml(sections), faults)
+    return head + dump_yaml(sections), faults
 
 
 def _contact(

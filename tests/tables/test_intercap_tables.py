@@ -293,8 +293,8 @@ def rooms(tmp_path: Path, moved: tuple[float, float]) -> tuple[SequenceEntry, di
 
 def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
     sequence, folders = rooms(tmp_path, (0.03, 1.0))
-    choice = choose_calibration(sequence, folders)
-    assert choice.best == "third" and choice.residual_m["third"] < 0.7 * choice.residual_m["first"]
+    best, residual_m = choose_calibration(sequence, folders)
+    assert best == "third" and residual_m["third"] < 0.7 * residual_m["first"]
     monkeypatch.chdir(tmp_path)
     write_keypoints(tmp_path / "kp" / "04/05/Seg_0" / "k1")
     objects = str(ROOT / "config/objects.yaml")
@@ -307,6 +307,6 @@ def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
 
 def test_equal_calibrations_are_not_decided(tmp_path):
     sequence, folders = rooms(tmp_path, (0.0, 0.0))
-    assert choose_calibration(sequence, folders).best is None
+    assert choose_calibration(sequence, folders)[0] is None
     (folders["second"] / "Color.json").write_text(json.dumps({}))
-    assert choose_calibration(sequence, folders).best is None
+    assert choose_calibration(sequence, folders)[0] is None
