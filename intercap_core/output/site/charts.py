@@ -55,11 +55,11 @@ def line_chart(
         return top + inner_height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
 
     parts = [_open(_WIDTH, height, f"{y_label} by {x_label}")]
-    for tick in ticks(*y_range):
+    for tick in ticks(y_range[0], y_range[1]):
         y = at_y(tick)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - right}" {_same("y", y)}/>')
         parts.append(_text(_LEFT - 6, y + 4, _number(tick), "tick", "end"))
-    for tick in ticks(*x_range):
+    for tick in ticks(x_range[0], x_range[1]):
         x = at_x(tick)
         parts.append(_text(x, height - bottom + 16, _number(tick), "tick", "middle"))
         parts.append(f'<line class="grid" {_same("x", x)} y1="{top}" y2="{top + inner_height}"/>')

@@ -34,7 +34,7 @@ def render(template: str, context: Mapping[str, Any]) -> str:
     return environment.get_template(template).render({**shared, **context})
 
 
-def css(colour: Sequence[float]) -> str:
+def css(colour: Sequence[float] | np.ndarray) -> str:
     """Format a colour in 0..1 for CSS."""
     return "#" + "".join(f"{round(255 * c):02x}" for c in colour)
 

@@ -38,7 +38,7 @@ def scan_page(name: str, sequences: Sequence[str], mesh: ScannedMesh) -> str:
 
 def _picture(mesh: ScannedMesh, colours: np.ndarray, side: str) -> drawing.EncodedImage:
     """Picture of the mesh from one side; ``colours``: (V, 3) RGB in 0..1."""
-    away = np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * 2.5
+    away = 2.5 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     direction = np.array(_SIDES[side], float)
     up = np.array([0.0, 1, 0]) if direction[2] else np.array([0.0, 0, 1])
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
