@@ -242,7 +242,7 @@ _KINDS = (
     _project("annotation", "yaml", ["annotations/one.yaml"], _read_project),
     _project("keypoint-definition", "text", ["definition.tsv"], _read_definition),
     _project("intercap-annotation", "text", ["contact.txt", "config.ini"],
-             lambda folder: Notes(convert(folder, np.arange(200), with_pose=True).faults),
+             lambda folder: Notes(convert(folder, np.arange(200), with_pose=True)[1]),
              "contact", "object_pose"),
     _project("behave-info", "json", ["info.json"], behave._gender),
     _mesh("mesh-ply", "bytes", "box.ply"),

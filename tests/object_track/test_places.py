@@ -207,5 +207,5 @@ def test_a_track_starts_next_to_a_twin_with_better_detections():
 def test_a_twin_with_nobody_near_has_a_low_prior():
     _, observer = twins_of("bottle", missed=range(6))
     assert sorted(observer.frames_to_search()) == [0, 1, 2]
-    priors = [prior for _, prior in observer.places._standing]
+    priors = [place.prior for place in observer.places._standing]
     assert priors and max(priors) < 0.5

@@ -14,7 +14,7 @@ from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.sides import LEGS, swap_sides
+from intercap_core.person.sides import exchange_points
 from intercap_core.person.subject_joints import steady_sides
 from intercap_core.schemas import PERSON
 from intercap_core.stages import person
@@ -183,10 +183,11 @@ def test_missing_people_and_foreign_captures_are_rejected(tmp_path, detected):
 def test_two_views_undo_a_temporary_side_exchange(detected):
     views = Rig(RIG.cameras[:2])
     exchanged = detected[:, :2].copy()
-    exchanged[3:6, 0] = swap_sides(exchanged[3:6, 0], LEGS)
+    legs = np.tile([False, True, False, False], (3, 1))  # of person.sides.LIMBS
+    exchanged[3:6, 0] = exchange_points(exchanged[3:6, 0], legs)
     found = steady_sides(exchanged, views, min_confidence=0.3)
     np.testing.assert_array_equal(found, detected[:, :2])
     # with more views their vote decides
     six = detected.copy()
-    six[3:6, 0] = swap_sides(six[3:6, 0], LEGS)
+    six[3:6, 0] = exchange_points(six[3:6, 0], legs)
     np.testing.assert_array_equal(steady_sides(six, RIG, min_confidence=0.3), six)
