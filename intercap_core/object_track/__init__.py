@@ -34,8 +34,4 @@ Terms:
 - Evidence: what the images say about a pose. In ``likelihood`` and ``decoder`` it is a
   log-likelihood ratio, in ``evidence``, ``rest`` and ``smooth`` a quadratic form of steps.
 - Share: independent observations per frame, at most 1, because errors of masks last 0.3 s.
-
-Arguments of many functions: ``context``, object and settings of all fits; ``mesh``, the object, and
-``field``, its distance field; ``labels``, detector classes of the object; ``views``, the views of a
-frame set; ``t``, a frame; ``times`` (T,) in seconds.
 """

@@ -75,10 +75,13 @@ class Appearance:
     def __init__(
         self, sightings: Sequence[SurfaceColours], views: int, paint: Paint | None, size: float
     ) -> None:
-        """Learn the colours from ``sightings`` of one frame each, at its pose.
+        """Learn the colours.
 
-        ``paint`` are colours of the mesh, ignored if they do not explain the learnt ones. ``size``
-        is that of a patch, metres.
+        Args:
+            sightings: colours of one frame each, at its pose.
+            views: number of views.
+            paint: colours of the mesh; ignored if they do not explain the learnt ones.
+            size: size of a patch, metres.
         """
         self.sightings = tuple(sightings)
         self._patches = np.unique(np.concatenate([s.patch for s in sightings]))

@@ -208,8 +208,12 @@ class FilledTrack:
 def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> FilledTrack:
     """Fill in the lost frames of a track by the likeliest path between known frames.
 
-    Known ``poses`` (T, 4, 4) are replaced by equivalent ones that follow each other. ``lost`` (T,)
-    bool.
+    Known poses are replaced by equivalent ones that follow each other.
+
+    Args:
+        observer: the recording.
+        poses: (T, 4, 4) of the track.
+        lost: (T,) bool.
     """
     count, symmetry, known = len(poses), observer.mesh.symmetry, ~lost
     track = unwrap_symmetry(symmetry, poses, known)

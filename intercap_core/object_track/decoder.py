@@ -45,7 +45,9 @@ def step_log_ratios(
     """Return log-probabilities of the steps between the hypotheses of two frames.
 
     Args:
-        before, after: (K, 4, 4) and (L, 4, 4) poses.
+        mesh: the object.
+        before: (K, 4, 4) poses.
+        after: (L, 4, 4) poses.
         seconds: time between the frames.
         hands: motions of the H hands, None if unknown. A hand must be near enough to hold the
             object.

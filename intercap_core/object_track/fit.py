@@ -96,6 +96,8 @@ def fit_pose(
     moves the seen object by the same step.
 
     Args:
+        context: object and settings.
+        views: views of the frame set.
         pose: (4, 4) start, master_from_object.
         prior: prior of the pose, if any.
         rounds: Gauss-Newton steps at most. Before each round, every view chooses its candidate.

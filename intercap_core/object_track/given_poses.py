@@ -83,8 +83,12 @@ class GivenEvidence:
         annotated frame. All carried frames of one annotated pose together count as one observation,
         since they depend on one unknown velocity.
 
-        ``poses`` (T, 4, 4) are those of the track, ``unseen`` (T,) frames whose images do not show
-        the object.
+        Args:
+            mesh: the object.
+            given: annotated poses.
+            poses: (T, 4, 4) of the track.
+            unseen: (T,) frames whose images do not show the object.
+            times: (T,) seconds.
         """
         reference, information = poses.copy(), np.zeros((len(poses), 6, 6))
         annotated = {pose.frame: pose for pose in given}
@@ -112,8 +116,10 @@ class GivenEvidence:
         These are the frames of segments that no other frame sees, and of segments in which an
         annotated pose disagrees with the nearest observed pose.
 
-        ``poses`` (T, 4, 4) are those of the track, ``segment`` (T,) is the number of the rest
-        segment, -1 while the object moves.
+        Args:
+            mesh: the object.
+            poses: (T, 4, 4) of the track.
+            segment: (T,) number of the rest segment, -1 while the object moves.
         """
         result = np.zeros(len(segment), bool)
         stated = self.carried.copy()
@@ -140,7 +146,12 @@ class GivenEvidence:
 def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the seconds (T,) to the nearest of ``frames`` that is connected by unseen frames.
 
-    It is 0 in ``frames`` themselves, and infinite if no frame is connected. ``unseen`` (T,) bool.
+    It is 0 in ``frames`` themselves, and infinite if no frame is connected.
+
+    Args:
+        frames: frames of annotated poses.
+        unseen: (T,) bool.
+        times: (T,) seconds.
     """
     result = np.full(len(unseen), np.inf)
     for frame in frames:
@@ -160,8 +171,13 @@ def flag_edges(
 
     An object that moves out of sight there moves fast: a swung racquet moves by a decimetre in
     19 ms, a possible time offset of a view. The unseen side does not constrain its velocity, so
-    that the pose at the frame's time is less certain than the covariance states. ``fits`` are those
-    of all T frames, ``unseen`` (T,) bool.
+    that the pose at the frame's time is less certain than the covariance states.
+
+    Args:
+        fits: fit of each frame.
+        unseen: (T,) bool.
+        frames: frames of annotated poses.
+        times: (T,) seconds.
     """
     since = np.abs(times[:, None] - times[list(frames)]).min(1, initial=np.inf)
     padded = np.pad(unseen, 1)

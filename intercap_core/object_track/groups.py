@@ -113,6 +113,7 @@ def outline_residuals(
     metres at the object.
 
     Args:
+        outline: outline of the mask.
         hull: (H, 3) vertices of the convex hull, object frame.
         rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
 
@@ -201,6 +202,9 @@ def find_groups(
     are ranked by the sum of their candidates' label priors times the prior of the place.
 
     Args:
+        mesh: the object.
+        views: views of the frame set.
+        labels: detector classes of the object.
         place_prior: prior of a position (3,) to be that of the object; groups at 0 are dropped.
         limit: largest number of groups.
 

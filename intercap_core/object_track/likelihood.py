@@ -56,6 +56,8 @@ def log_ratio(
     """Return the log-likelihood ratio of a pose in one view, nats.
 
     Args:
+        context: object and settings.
+        view: the view.
         pose: (4, 4) master_from_object.
         silhouette, drawn_depth: renderings of the pose in the colour and the depth image; the
             latter None without depth.

@@ -52,8 +52,15 @@ def size_doubt(
 ) -> str | None:
     """Return a warning if the mesh is several times larger or smaller than the detected object.
 
-    None if the size fits, if no candidate has one of the labels, or if too few candidates lie on
-    measured depth. ``diameter_m`` is that of the mesh.
+    Args:
+        frames: the recording.
+        detections: candidates of the recording.
+        diameter_m: diameter of the mesh, metres.
+        labels: detector classes of the object.
+
+    Returns:
+        The warning. None if the size fits, if no candidate has one of the labels, or if too few
+        candidates lie on measured depth.
     """
     sets = np.linspace(0, frames.num_sets - 1, 6).round().astype(int)
     extents = [

@@ -115,7 +115,10 @@ def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
 def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Replace known poses (T, 4, 4) by symmetric equivalents, each closest to the known one before.
 
-    ``known`` (T,) bool.
+    Args:
+        symmetry: of the object.
+        poses: (T, 4, 4).
+        known: (T,) bool.
     """
     result = poses.copy()
     if not symmetry.trivial:

@@ -47,9 +47,12 @@ class Places:
     """Places where candidates were seen, with the prior that the tracked object is there."""
 
     def __init__(self, mesh: ObjectMesh, standing: list[OccupiedPlace], joints: np.ndarray) -> None:
-        """Initialise the prior from occupied places, whose priors are computed.
+        """Initialise the prior from occupied places, whose own priors are computed.
 
-        ``joints`` (T, K, 3) of the person are in the master frame, NaN where unknown.
+        Args:
+            mesh: the object.
+            standing: occupied places.
+            joints: (T, K, 3) of the person, master frame, metres; NaN = unknown.
         """
         self._reach = 0.5 * mesh.radius  # from the object's centre to its surface, about
         self._same = _same_place_m(mesh)
@@ -68,9 +71,17 @@ class Places:
         labels: tuple[str, ...],
         joints: np.ndarray,
     ) -> tuple[Places, list[int]]:
-        """Survey a few of the ``count`` frames of the recording, whose views ``load`` returns.
+        """Survey a few frames of the recording.
 
-        Returns the places, and the surveyed frames with candidates, the most promising first.
+        Args:
+            mesh: the object.
+            load: returns the views of a frame.
+            count: number of frames.
+            labels: detector classes of the object.
+            joints: (T, K, 3) of the person, as in the constructor.
+
+        Returns:
+            The places, and the surveyed frames with candidates, the most promising first.
         """
         frames = sorted({int(t) for t in np.linspace(0, count - 1, 12).round()})
         seen = []
@@ -108,7 +119,14 @@ class Places:
         3. Elsewhere the object moves: up to ``OTHER_OBJECT_LOG_RATIO`` is subtracted if the person
            is not near.
 
-        Returns the log-likelihood ratio with the prior, nats. ``ratio`` is that of the images.
+        Args:
+            t: frame.
+            place: (3,) position, master frame.
+            ratio: log-likelihood ratio of the images, nats.
+            share: independent observations per frame.
+
+        Returns:
+            Log-likelihood ratio with the prior, nats.
         """
         if self._index(self._others, place) is not None:
             return min(ratio, 0.0) - OTHER_OBJECT_LOG_RATIO

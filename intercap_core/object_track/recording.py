@@ -41,9 +41,14 @@ class ObjectRecording:
     def __init__(
         self, frames: Frames, detections: Detections, scene: Path, person: Path, diameter_m: float
     ) -> None:
-        """Open the views of a recording; ``scene`` and ``person`` are artefacts of the stages.
+        """Open the views of a recording.
 
-        ``diameter_m`` is the diameter of the object.
+        Args:
+            frames: the recording.
+            detections: candidates of the recording.
+            scene: artefact of stage ``scene``.
+            person: artefact of stage ``person``.
+            diameter_m: diameter of the object, metres.
         """
         rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as artefact:

@@ -135,9 +135,16 @@ def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: n
 def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedMask | None:
     """Remove the person from a candidate that covers both person and object.
 
-    Slivers along the person's silhouette are discarded. Returns the largest remaining part; None if
-    the candidate does not cover the person, or nothing else. ``step`` is the reduction of both
-    masks.
+    Slivers along the person's silhouette are discarded.
+
+    Args:
+        mask: the candidate.
+        person: the person's mask.
+        step: reduction of both masks.
+
+    Returns:
+        The largest remaining part. None if the candidate does not cover the person, or nothing
+            else.
     """
     least = 0.25 * person.area  # pixels of the person that the candidate covers
     if not person.area or mask.area < least:

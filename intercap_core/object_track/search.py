@@ -55,6 +55,9 @@ def search_pose(
     """Search the pose of a frame set.
 
     Args:
+        context: object and settings.
+        field: distance field of the mesh.
+        views: views of the frame set.
         up: (3,) vertical in the master frame: standing poses are tried more finely.
         place_prior: prior, 0 to 1, of a position (3,).
         rotations: (N, 3, 3) rotations to try; None = a grid of all.
@@ -108,7 +111,11 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     """Order the frames for searching.
 
     Frames in which more views have a candidate with a likely label come first. Among equal frames
-    the next one is far from those already ordered. ``labels_by_view`` [T][C][candidates].
+    the next one is far from those already ordered.
+
+    Args:
+        labels_by_view: labels [T][C][candidates].
+        labels: detector classes of the object.
     """
     count = len(labels_by_view)
 
@@ -211,6 +218,7 @@ def _to_points(
     """Linearise the distances of P points from the surface at N poses, by steps in its own frame.
 
     Args:
+        field: distance field of the mesh.
         cloud, eyes: (P, 3) points and the camera centre of each, master frame.
         rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
         scale: Geman-McClure scale, metres.

@@ -35,8 +35,10 @@ def smooth(
     """Solve for the poses (T, 4, 4) and covariances (T, 6, 6) of all frames.
 
     Args:
+        evidence: evidence of the frames.
         start: (T, 4, 4) start poses.
         node: (T,) number of each frame's node from 0, ascending; resting frames share a node.
+        times: (T,) seconds.
         centre: (3,) of the object, whose path is smooth.
         stated: evidence of annotated poses, which is not robust and counts in full at rest.
     """

@@ -80,8 +80,14 @@ def _align_turned(
     """Shift turned surfaces so that most of each falls onto the original surface.
 
     Robust point-to-plane ICP in the shift alone, in five steps. The scale shrinks from six times to
-    once the distance of a clearly displaced point (:func:`_far`). Returns the turns ``rotations``
-    (N, 3, 3) with their shifts (N, 4, 4), and the share (N,) of the surface that is displaced.
+    once the distance of a clearly displaced point (:func:`_far`).
+
+    Args:
+        mesh, field: the object and its distance field.
+        rotations: (N, 3, 3).
+
+    Returns:
+        The turns with their shifts (N, 4, 4), and the share (N,) of the surface that is displaced.
     """
     points, far = _surface(mesh), _far(mesh)
     turned = points @ rotations.transpose(0, 2, 1)

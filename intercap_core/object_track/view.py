@@ -69,7 +69,13 @@ class ViewGeometry:
 
         The object is compared at about 80 pixels across in colour and 60 in depth. More cost time
         and carry no more information, since neighbouring pixels of an image err together.
-        ``distance_m`` is the usual distance of the object from the camera.
+
+        Args:
+            camera: the camera.
+            diameter_m: diameter of the object, metres.
+            distance_m: usual distance of the object from the camera, metres.
+            depth_bias_m: as the field.
+            time_offset_s: as the field.
         """
         angle = diameter_m / distance_m
         step = _step(camera.colour.fx, angle, 80)
@@ -96,9 +102,12 @@ class ViewGeometry:
 
 
 def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
-    """Return the median distance of each camera from the person's joints (T, K, 3), metres.
+    """Return the median distance of each camera from the person's joints, metres.
 
-    If no joint is known (NaN), all distances are 2.5 m, as usual in a capture ring.
+    Args:
+        cameras: C cameras.
+        joints: (T, K, 3) of the person, master frame, NaN where unknown. If no joint is known, all
+            distances are 2.5 m, as usual in a capture ring.
     """
     places = joints[np.isfinite(joints).all(-1)]
     if not len(places):

@@ -223,9 +223,11 @@ class WholeTrack:
     ) -> np.ndarray:
         """Decide the status (T,) of each frame.
 
-        ``decided`` (T,) are the log-likelihood ratios of the poses before smoothing, nats. In the
-        frames ``gone`` (T,) the object has left by the decision: such a frame is GONE instead of
-        LOST if nothing else determines its pose.
+        Args:
+            smoothed: the solution over all frames.
+            decided: (T,) log-likelihood ratios of the poses before smoothing, nats.
+            gone: (T,) frames in which the object has left by the decision; such a frame is GONE
+                instead of LOST if nothing else determines its pose.
         """
         ratio = np.array([fit.log_ratio for fit in smoothed.fits])
         poses = np.array([fit.pose for fit in smoothed.fits])
@@ -260,7 +262,10 @@ class WholeTrack:
     ) -> _SmoothedTrack:
         """Solve for the track, evaluate the images at the solution, and solve again.
 
-        In ``lost`` frames (T,) the pose is filled in, and the images are no evidence.
+        Args:
+            fits: decided fit of each frame.
+            lost: (T,) frames whose pose is filled in and whose images are no evidence.
+            given: annotated poses.
         """
         count = len(fits)
         filled = fill_lost(self._observer, np.array([fit.pose for fit in fits]), lost)

@@ -14,8 +14,4 @@ In the order of a run:
    views and time; ``sides`` has the index tables, and sides stated by the user.
 4. ``masks`` chooses the detector's candidate that is the subject. Images without a detector's
    candidates are segmented by ``segmentation``.
-
-Arguments of many functions, T sets and C cameras: ``times`` (T,), seconds of the sets;
-``keypoints`` (T, C, 135, 3), x, y, confidence; ``min_confidence``, below which keypoints are
-ignored; ``image_of`` (T, C), recorded frame whose image shows each moment, -1 = none.
 """

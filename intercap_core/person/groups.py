@@ -128,7 +128,9 @@ class PersonGroup:
 def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[PersonGroup]:
     """Group the people of one set; the person with most support first.
 
-    ``people`` (P, 25, 3) are x, y, confidence of the P people of each view.
+    Args:
+        people: (P, 25, 3) x, y, confidence of the P people of each view.
+        min_confidence: keypoints of lower confidence are ignored.
     """
     rays, seen = [], []
     for c, own in enumerate(people):

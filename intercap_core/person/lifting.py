@@ -179,8 +179,13 @@ class Lifter:
         Each such set uses the one view that yields most points; it becomes the only inlier of the
         new points. ``triangulation`` is changed in place.
 
-        ``person`` (T, C) is the index of the subject's detection; -1 = not seen. Returns the mask
-        (T,) of sets with lifted points.
+        Args:
+            person: (T, C) index of the subject's detection; -1 = not seen.
+            keypoints: (T, C, 135, 3) of the subject.
+            triangulation: triangulation of T * 135 points.
+
+        Returns:
+            (T,) bool, sets with lifted points.
         """
         sets, views = person.shape
         points = triangulation.points.reshape(sets, -1, 3)

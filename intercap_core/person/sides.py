@@ -51,7 +51,10 @@ def exchange_everywhere(
 ) -> tuple[np.ndarray, Triangulation]:
     """Return keypoints and triangulation with left and right exchanged, in all views of a set.
 
-    ``which`` (T, 4) bool are the limbs to exchange in each set, in the order of :data:`LIMBS`.
+    Args:
+        keypoints: (T, C, 135, n).
+        points: triangulation of T * 135 points.
+        which: (T, 4) bool, limbs to exchange in each set, in the order of :data:`LIMBS`.
     """
     keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), which), 1, 2)
     parts = (points.points, points.inlier, points.error, points.view_error)
@@ -73,8 +76,14 @@ def images_with_stated_sides(
 ) -> np.ndarray:
     """Mask (T, C) of the images in which the user states that left and right are exchanged.
 
-    ``stated`` are the entries of the annotation, whose ranges count recorded frames. Raises
-    UserError if one names an unknown camera.
+    Args:
+        stated: entries of the annotation; their ranges count recorded frames.
+        names: camera names.
+        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
+        sequence: name, for messages.
+
+    Raises:
+        UserError: an entry names an unknown camera.
     """
     result = np.zeros(image_of.shape, bool)
     for number, sides in enumerate(stated):

@@ -95,6 +95,8 @@ def find_subject(
 
     Args:
         detections: people of each image, by moment.
+        times: (T,) seconds.
+        min_confidence: keypoints of lower confidence are ignored.
         lift: locates people of single views in sets in which no two views agree on a person.
         touches: contact with the object; None = not evaluated.
         named: detections named by the user.

@@ -27,8 +27,11 @@ def named_people(
 
     It is the person whose bones are closest to the point, relative to the person's size in pixels.
 
-    ``points`` are entries of the annotation ``subject`` and count recorded frames; ``detections``
-    are by moment.
+    Args:
+        points: entries of the annotation ``subject``; they count recorded frames.
+        detections: by moment.
+        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
+        min_confidence: keypoints of lower confidence are ignored.
 
     Raises:
         UserError: unknown camera, frame without an image, point outside the image, or nobody there.

@@ -39,10 +39,15 @@ def at_set_times(
     *,
     min_confidence: float,
 ) -> np.ndarray:
-    """Move keypoints (T, C, K, 3) from each camera's exposure to ``times``.
+    """Move keypoints (T, C, K, 3) from each camera's exposure to ``times`` (T,).
 
-    Uses the velocity in the image, from neighbouring sets and limited at jumps. ``time_offset``
-    (C,) are the seconds from the time of a set to the exposure of each camera.
+    Uses the velocity in the image, from neighbouring sets and limited at jumps.
+
+    Args:
+        keypoints: (T, C, K, 3) x, y, confidence.
+        times: (T,) seconds of the sets.
+        time_offset: (C,) seconds from the time of a set to the exposure of each camera.
+        min_confidence: keypoints of lower confidence have no velocity.
     """
     result = keypoints.copy()
     known = keypoints[..., 2] >= min_confidence
@@ -79,7 +84,8 @@ def triangulate_people(
 
     Args:
         keypoints: (T, C, 135, 3 or more) x, y, confidence, and further values of each point.
-        times: None = motion from set to set is not evaluated.
+        times: (T,) seconds; None = motion from set to set is not evaluated.
+        min_confidence: keypoints of lower confidence are ignored.
         max_error_px: largest reprojection error of an inlier, px at 1080p.
 
     Returns:
@@ -108,6 +114,13 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 
     For each view and limb, dynamic programming selects the sides of least image motion over all
     sets. With more views, their agreement decides (:mod:`.left_right`).
+
+    Args:
+        keypoints: (T, C, 135, 3).
+        min_confidence: keypoints of lower confidence have no motion.
+
+    Returns:
+        (T, C, 135, 3) keypoints with corrected sides.
     """
     result = keypoints.copy()
     few = (keypoints[..., 2] > 0).any(2).sum(1) <= 4  # tuned on the studio
@@ -126,8 +139,12 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
     """Mask (S,) of the sets that are exchanged in the sequence of least motion.
 
-    Costs are pixels at 1080p, times ``scale``; tuned on the studio. ``options`` (2, S, n, 3) are
-    the limb's keypoints as detected, and with the sides exchanged.
+    Costs are pixels at 1080p, times ``scale``; tuned on the studio.
+
+    Args:
+        options: (2, S, n, 3) the limb's keypoints as detected, and with the sides exchanged.
+        scale: pixels of the camera per pixel at 1080p.
+        min_confidence: keypoints of lower confidence have no motion.
     """
     price = np.array([0.0, 3.0 * scale])  # for each exchanged set: detectors are mostly right
     # For an exchange in the first or last set. It has a single jump, which may also be a fast turn

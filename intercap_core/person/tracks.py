@@ -158,8 +158,11 @@ def join_tracks(
 ) -> list[Person]:
     """Join the tracks of a recording to people, by agglomerative clustering.
 
-    The pair of greatest likelihood is joined, until all remaining pairs are :data:`NEVER`. The
-    tracks ``together`` are one person by the user's statement, the first of the result.
+    The pair of greatest likelihood is joined, until all remaining pairs are :data:`NEVER`.
+
+    Args:
+        times: (T,) seconds.
+        together: tracks of one person by the user's statement; the first person of the result.
     """
     rest = [track for track in tracks if track not in together]
     people = [Person(_ordered(together))] if together else []

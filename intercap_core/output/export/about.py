@@ -76,6 +76,7 @@ class ExportBody:
         return OPEN if self.is_open else SMPLX
 
     def to_json(self) -> dict[str, Any]:
+        """Serialize for JSON."""
         return {
             "surface_model_type": self.surface_model,
             "body_file": self.path.name,
@@ -87,6 +88,7 @@ class ExportBody:
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         return {key: np.array(value) for key, value in self.to_json().items()}
 
 
@@ -129,6 +131,7 @@ class Verdict:
         }
 
     def per_frame_json(self) -> dict[str, Any]:
+        """Serialize the stated errors by part and frame."""
         return {
             "stated_error_mm": {
                 self.stated[part].part: rounded_lists(self.per_frame_mm[part], 2)
@@ -147,6 +150,7 @@ class Verdict:
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         stated = [self.stated[part] for part in self.stated_parts]
         arrays = {
             "stated_error_part": np.array([error.part for error in stated]),
@@ -300,12 +304,15 @@ class About:
         return entries | {"by_frame": by_frame}
 
     def to_json_text(self, coordinates: Coordinates) -> str:
+        """Serialize to the text of a JSON file."""
         return json.dumps(self.to_json(coordinates), separators=(",", ":")) + "\n"
 
     def write_json(self, path: Path, coordinates: Coordinates) -> None:
+        """Write the JSON file."""
         path.write_text(self.to_json_text(coordinates), encoding="utf-8")
 
     def to_arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         return {
             **self.body.to_arrays(),
             **coordinates.to_arrays(),

@@ -136,6 +136,7 @@ class ContactVertices:
         return cls(*surfaces)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         arrays = {"contact_threshold_m": np.array(CONTACT_M)}
         for name, surface in (("body", self.body), ("object", self.object_)):
             arrays |= {

@@ -169,6 +169,7 @@ class Coordinates:
 
     @classmethod
     def of(cls, motion: Motion, units: str = METRES) -> Coordinates:
+        """Return the coordinates of a motion."""
         return cls(motion.frame, motion.up, units)
 
     @property
@@ -180,6 +181,7 @@ class Coordinates:
         return "none: see the vector up" if np.isfinite(self.up).all() else "unknown"
 
     def to_json(self) -> dict[str, Any]:
+        """Serialize for JSON."""
         return {
             "frame": self.frame,
             "up_axis": self.up_axis,
@@ -188,6 +190,7 @@ class Coordinates:
         }
 
     def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         arrays = {key: np.array(value) for key, value in self.to_json().items()}
         return arrays | {"up": self.up.astype(np.float64)}
 

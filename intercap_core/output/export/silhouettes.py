@@ -39,6 +39,7 @@ class Mask:
 
     @property
     def area(self) -> int:
+        """Number of set pixels."""
         return int(np.count_nonzero(self.pixels))
 
     def box(self) -> list[int]:

@@ -109,10 +109,12 @@ class Hold:
 
     @property
     def frame(self) -> int:
+        """Frame that is drawn."""
         return (self.first + self.last) // 2
 
     @property
     def caption(self) -> str:
+        """Caption of a picture."""
         frames = span(self.first, self.last)
         return f"{self.side} hand, frames {frames}, drawn at {self.frame}"
 

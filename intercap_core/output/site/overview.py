@@ -88,6 +88,7 @@ class DatasetContent:
 
 
 def page(content: DatasetContent) -> str:
+    """Return the HTML of the page."""
     measured = [s.metrics for s in content.sequences]
     rows = _rows(content)
     runs = [

@@ -53,6 +53,7 @@ class SequenceContent:
 
 
 def page(content: SequenceContent) -> str:
+    """Return the HTML of the page."""
     s = content.metrics
     flagged = s.flags.texts()
     cameras = [

@@ -29,6 +29,7 @@ POLICY = (
 
 
 def style() -> str:
+    """Return the CSS of the viewer."""
     return (DATA / "viewer.css").read_text(encoding="utf-8")
 
 
