@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import socket
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,15 @@ import h5py
 import hdf5plugin  # registers the depth codec with HDF5 before any file is opened
 import numpy as np
 
+from intercap_core.artefact_schema import (
+    Contradiction,
+    Field,
+    Schema,
+    attribute_value,
+    check_shape,
+    check_size,
+    validate,
+)
 from intercap_core.disk import PartFile
 from intercap_core.errors import UserError
 
@@ -31,71 +41,12 @@ PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # one chunk fits into HDF5's default chunk cache
 GROWING_CHUNK_BYTES = 1 << 16  # of datasets of unknown length, whose last chunk is partly empty
-_CHECKED_BYTES = 1 << 30  # the ratio is not checked for smaller datasets
-_MAX_RATIO = 1 << 16  # bytes unpacked per byte stored; Blosc2 packs a chunk of zeros into 32 bytes
+# Exceptions of h5py for damaged contents
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, MemoryError)
 
 
 class Unreadable(UserError):
     """An artefact that is missing, damaged or of another schema."""
-
-
-class _Contradiction(ValueError):
-    """A file or dataset contradicts its schema; the message lacks the file's name."""
-
-
-@dataclass(frozen=True)
-class Field:
-    """Declaration of one dataset."""
-
-    dims: tuple[str, ...]
-    """Name of each axis. Axes of one name have the same length in a file, or in the group of a
-    camera unless the name is in ``_SHARED_DIMS``; digits are a length."""
-    dtype: str
-    """Numpy type, or "str"."""
-    doc: str
-    """Description for the generated documentation."""
-    units: str = "1"
-    """Unit of the values."""
-    frame: str = ""
-    """Coordinate frame of the values; "" if they have none."""
-    optional: bool = False
-    """Whether a file may lack the dataset."""
-    codec: str = "gzip"
-    """"gzip", "depth" (Blosc2, lossless) or "none" (for compressed values)."""
-
-
-@dataclass(frozen=True)
-class Schema:
-    """Declaration of a stage's artefact."""
-
-    name: str
-    """Name of the schema, stored in the file."""
-    version: int
-    """Version of the schema; files with another version are rejected."""
-    stage: str
-    """Stage that writes it."""
-    fields: Mapping[str, Field]
-    """Datasets by key; a key with ``{camera}`` declares one dataset per camera."""
-    attributes: Mapping[str, str] = field(default_factory=dict)
-    """Descriptions of the root attributes."""
-    optional_attributes: Mapping[str, str] = field(default_factory=dict)
-    """Descriptions of root attributes that a file may lack."""
-    frame: str = "master colour camera: x right, y down, z forward"
-    """Default coordinate frame."""
-    units: str = "metres, seconds, radians unless a dataset says otherwise"
-    """Default units."""
-
-    def field_of(self, key: str) -> Field:
-        """Declaration of the dataset ``key``; raises KeyError if there is none."""
-        if key in self.fields:
-            return self.fields[key]
-        for template, declared in self.fields.items():
-            head, _, tail = template.partition("{camera}")
-            if tail and key.startswith(head) and key.endswith(tail):
-                middle = key[len(head) : len(key) - len(tail)]
-                if middle and "/" not in middle:
-                    return declared
-        raise KeyError(f"schema {self.name!r} declares no dataset {key!r}")
 
 
 def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
@@ -104,13 +55,6 @@ def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
     if declared.codec == "gzip":
         return {"compression": "gzip", "compression_opts": 1, "shuffle": dtype.itemsize > 1}
     return {}
-
-
-def _chunks(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Shape of a chunk: complete rows of the first axis, up to ``CHUNK_BYTES``."""
-    row = itemsize * int(np.prod([max(1, n) for n in shape[1:]], dtype=np.int64))
-    rows = max(1, min(max(1, shape[0]), CHUNK_BYTES // row))
-    return (rows, *(max(1, n) for n in shape[1:]))
 
 
 class Writer:
@@ -131,9 +75,7 @@ class Writer:
         """
         declared = self._schema.field_of(key)
         if declared.dtype == "str":
-            encoded = [str(v).encode() for v in values]
-            width = max([len(e) for e in encoded] + [1])
-            array = np.array(encoded, dtype=f"S{width}")
+            array = np.array([str(v).encode() for v in values], dtype="S")
         else:
             array = np.asarray(values)
             target = np.dtype(declared.dtype)
@@ -157,20 +99,21 @@ class Writer:
         """Create a dataset; ``grows``: rows will be appended along the first axis."""
         declared = self._schema.field_of(key)
         group = key.rpartition("/")[0] if key not in self._schema.fields else ""
-        _check_shape(key, declared, shape, self._dims, group=group, grows=grows)
-        chunks = _chunks(shape, dtype.itemsize)
+        check_shape(key, declared, shape, self._dims, group=group, grows=grows)
+        row_shape = [max(1, n) for n in shape[1:]]
+        row_bytes = dtype.itemsize * math.prod(row_shape)
+        rows = min(max(1, shape[0]), CHUNK_BYTES // row_bytes)
         if declared.codec == "depth":
-            chunks = (1, *shape[1:])  # one image per chunk, because frames are read one by one
-        elif shape[0] == 0 and len(shape) == 1:
-            chunks = (CHUNK_BYTES // dtype.itemsize,)
+            rows = 1  # one image per chunk, because frames are read one by one
+        elif shape == (0,):
+            rows = CHUNK_BYTES // row_bytes
         elif grows:
-            row = dtype.itemsize * int(np.prod(shape[1:]))
-            chunks = (max(1, GROWING_CHUNK_BYTES // row), *shape[1:])
+            rows = GROWING_CHUNK_BYTES // row_bytes
         dataset = self._file.create_dataset(
             key,
             shape=shape,
             dtype=dtype,
-            chunks=chunks,
+            chunks=(max(1, rows), *row_shape),
             maxshape=tuple(None if n == 0 or i == 0 else n for i, n in enumerate(shape)),
             fletcher32=True,
             track_times=False,
@@ -180,39 +123,6 @@ class Writer:
         if declared.frame:
             _set(dataset, "frame", declared.frame)
         return dataset
-
-
-# Axes with one length in the whole file, also inside a camera's group.
-_SHARED_DIMS = frozenset({"T", "T+1", "C"})
-
-
-def _check_shape(
-    key: str,
-    declared: Field,
-    shape: tuple[int, ...],
-    lengths: dict[str, int],
-    *,
-    group: str = "",
-    grows: bool = False,
-) -> None:
-    """Raise _Contradiction unless a dataset's shape is the declared one.
-
-    Args:
-        lengths: lengths found so far by the name of the axis; those of this dataset are added.
-        group: group of a camera's datasets, within which other axes have their own lengths.
-        grows: the first axis may have any length.
-    """
-    if len(shape) != len(declared.dims):
-        raise _Contradiction(f"dataset {key!r} has shape {shape}, expected {declared.dims}")
-    for axis, (dim, length) in enumerate(zip(declared.dims, shape, strict=True)):
-        if grows and axis == 0:
-            continue
-        name = dim if dim in _SHARED_DIMS or not group else f"{group}:{dim}"
-        expected = int(dim) if dim.isdigit() else lengths.setdefault(name, length)
-        if length != expected:
-            raise _Contradiction(
-                f"dataset {key!r} has {length} entries along {dim}, expected {expected}"
-            )
 
 
 class RowStream:
@@ -247,7 +157,6 @@ def write(
         attributes: root attributes (str, int, float or bool); more can be set in
             ``Writer.attributes`` within the block.
     """
-    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path if path.suffix == PART else part_of(path)
     try:
@@ -283,26 +192,18 @@ def put_made_from(path: Path, text: str) -> None:
 
 def made_from(path: Path) -> str:
     """Text of an artefact's manifest, "" if it has none; raises Unreadable if it is no artefact."""
-    try:
-        with h5py.File(path, "r", locking="best-effort") as file:
-            return _value(file.attrs.get(MADE_FROM, ""))
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
-        raise Unreadable(f"{path}: cannot be read; delete it and re-run its stage") from None
+    with (
+        _reporting(path, "cannot be read", "re-run its stage"),
+        h5py.File(path, "r", locking="best-effort") as file,
+    ):
+        return attribute_value(file.attrs.get(MADE_FROM, ""))
 
 
 def _set(owner: h5py.File | h5py.Dataset, name: str, value: Any) -> None:
     """Set an attribute; texts have a fixed length."""
     if isinstance(value, str):
-        encoded = value.encode()
-        value = np.array(encoded, dtype=f"S{max(1, len(encoded))}")
+        value = np.array(value.encode(), dtype="S")
     owner.attrs[name] = value
-
-
-def _value(stored: Any) -> Any:
-    """Value of an attribute as a Python object."""
-    if isinstance(stored, bytes):
-        return stored.decode()
-    return stored.item() if isinstance(stored, np.generic) else stored
 
 
 def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: str) -> None:
@@ -316,44 +217,55 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
     unset = sorted(set(schema.attributes) ^ set_here)  # missing or not declared
     if missing or unset:
         raise ValueError(f"artefact {schema.name!r}: missing {missing}, attributes off: {unset}")
-    _set(file, "schema", schema.name)
-    _set(file, "schema_version", schema.version)
-    _set(file, "frame", schema.frame)
-    _set(file, "units", schema.units)
-    _set(file, "settings_digest", settings_digest)
-    for key in sorted(writer.attributes):
-        _set(file, key, writer.attributes[key])
-    _set(file, "complete", True)
+    attributes = {
+        "schema": schema.name, "schema_version": schema.version, "frame": schema.frame,
+        "units": schema.units, "settings_digest": settings_digest,
+        **dict(sorted(writer.attributes.items())), "complete": True,
+    }  # fmt: skip
+    for name, value in attributes.items():
+        _set(file, name, value)
+
+
+@contextlib.contextmanager
+def _reporting(path: Path, fault: str, again: str) -> Iterator[None]:
+    """Raise Unreadable for exceptions inside the block.
+
+    Args:
+        path: file that is read.
+        fault: message on damaged contents; a Contradiction has its own.
+        again: advice to make the file again.
+    """
+    try:
+        yield
+    except Contradiction as contradiction:
+        raise Unreadable(f"{path}: {contradiction}; {again}") from None
+    except _DAMAGE as error:
+        raise Unreadable(f"{path}: {fault}; delete it and {again}") from error
 
 
 class Artefact:
     """A validated artefact, open for reading; obtained from :func:`read`."""
 
-    def __init__(
-        self, file: h5py.File, path: Path, schema: Schema, datasets: Mapping[str, h5py.Dataset]
-    ) -> None:
+    def __init__(self, file: h5py.File, path: Path, schema: Schema) -> None:
+        self.path = path
         self._file = file
         self._schema = schema
-        self._datasets = dict(datasets)  # open ones; a lookup takes longer than a short read
-        self.path = path
-        self.attributes = {k: _value(v) for k, v in file.attrs.items() if k != MADE_FROM}
+        # open datasets, because a lookup takes longer than a short read
+        self._datasets = validate(file, schema)
+        self.attributes = {k: attribute_value(v) for k, v in file.attrs.items() if k != MADE_FROM}
 
     def __contains__(self, key: str) -> bool:
         if key in self._datasets or key not in self._file:
             return key in self._datasets
-        try:
+        with self._reporting(f"dataset {key!r} is damaged"):
             return isinstance(self._file[key], h5py.Dataset)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise self._damaged(f"dataset {key!r} is damaged") from error
 
     def keys(self, prefix: str = "") -> list[str]:
         """Sorted names of the datasets that begin with ``prefix``."""
         names: list[str] = []
-        try:
+        with self._reporting("its list of datasets is damaged"):
             self._file.visit(names.append)
             return sorted(name for name in names if name.startswith(prefix) and name in self)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise self._damaged("its list of datasets is damaged") from error
 
     def __getitem__(self, key: str) -> np.ndarray:
         """Read a dataset; texts are returned as an object array of ``str``."""
@@ -361,25 +273,15 @@ class Artefact:
 
     def rows(self, key: str, selection: Any) -> np.ndarray:
         """Read a part of a dataset, such as one image: ``rows("cameras/k1/depth", 7)``."""
-        if key not in self:
-            raise Unreadable(
-                f"{self.path}: dataset {key!r} is missing; re-run stage "
-                f"'{self._schema.stage}' for this sequence"
-            )
-        try:
+        with self._reporting(f"dataset {key!r} is damaged (its checksum does not match)"):
+            if key not in self:
+                raise Contradiction(f"dataset {key!r} is missing")
             if key not in self._datasets:
+                check_size(self._file[key], key)
                 self._datasets[key] = self._file[key]
-                self._check_size(key)
             values = self._datasets[key][selection]
-        except (OSError, RuntimeError, TypeError, AttributeError, MemoryError) as error:
-            # damaged, or a group
-            raise self._damaged(
-                f"dataset {key!r} is damaged (its checksum does not match)"
-            ) from error
         if isinstance(values, np.ndarray) and values.dtype.kind == "S":
-            return np.array([v.decode() for v in values.ravel()], dtype=object).reshape(
-                values.shape
-            )
+            return np.char.decode(values, "utf-8").astype(object)
         return values
 
     def blocks(self, key: str, size: int = 64) -> Iterator[np.ndarray]:
@@ -391,34 +293,26 @@ class Artefact:
 
     def describe(self, key: str) -> tuple[tuple[int, ...], str, str, str]:
         """Shape, type, units and frame of a dataset."""
-        try:
-            self._check_size(key)
+        with self._reporting(f"dataset {key!r} is damaged"):
             dataset = self._file[key]
+            check_size(dataset, key)
             return (
                 dataset.shape,
                 "text" if dataset.dtype.kind == "S" else str(dataset.dtype),
-                str(_value(dataset.attrs.get("units", ""))),
-                str(_value(dataset.attrs.get("frame", ""))),
-            )
-        except (OSError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-            raise self._damaged(f"dataset {key!r} is damaged") from error
-
-    def _check_size(self, key: str) -> None:
-        """Raise Unreadable if a dataset declares more than its stored bytes can hold."""
-        if _declares_too_much(self._file[key]):
-            raise self._damaged(
-                f"dataset {key!r} has shape {self._file[key].shape}, but too few bytes"
+                str(attribute_value(dataset.attrs.get("units", ""))),
+                str(attribute_value(dataset.attrs.get("frame", ""))),
             )
 
-    def _damaged(self, what: str) -> Unreadable:
-        return Unreadable(
-            f"{self.path}: {what}; delete the file and re-run stage '{self._schema.stage}' for "
-            "this sequence"
-        )
+    def _reporting(self, fault: str) -> AbstractContextManager[None]:
+        return _reporting(self.path, fault, _again(self._schema))
 
     def text(self, key: str) -> list[str]:
         """Read a dataset of texts as a list."""
         return [str(v) for v in self[key]]
+
+
+def _again(schema: Schema) -> str:
+    return f"re-run stage '{schema.stage}' for this sequence"
 
 
 def schema_name(path: Path) -> str:
@@ -426,13 +320,12 @@ def schema_name(path: Path) -> str:
     _check_is_file(path, "name an .h5 file that a stage wrote")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
-            name = _value(file.attrs["schema"])
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+            return str(attribute_value(file.attrs["schema"]))
+    except _DAMAGE:
         raise Unreadable(
             f"{path}: not an artefact of this program, or cut or damaged; name an .h5 file that a "
             "stage wrote, or delete this one and re-run its stage"
         ) from None
-    return str(name)
 
 
 def _check_is_file(path: Path, advice: str) -> None:
@@ -450,82 +343,14 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
 
     Raises :class:`Unreadable`, which names the file, its fault and the stage to re-run.
     """
-    path = Path(path)
-    again = f"re-run stage '{schema.stage}' for this sequence"
+    again = _again(schema)
     _check_is_file(path, again)
-    try:
+    with _reporting(path, "not a readable HDF5 file (damaged or half-written)", again):
         file = h5py.File(path, "r", locking="best-effort")
-    except OSError as error:
-        raise Unreadable(
-            f"{path}: not a readable HDF5 file (damaged or half-written); delete it and {again}"
-        ) from error
     with file:
-        try:
-            artefact = Artefact(file, path, schema, _validate(file, schema))
-        except _Contradiction as fault:
-            raise Unreadable(f"{path}: {fault}; {again}") from None
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-            raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
+        with _reporting(path, "its contents are damaged", again):
+            artefact = Artefact(file, path, schema)
         yield artefact
-
-
-def _validate(file: h5py.File, schema: Schema) -> dict[str, h5py.Dataset]:
-    """Check the file against the schema; returns its declared datasets by key.
-
-    Raises _Contradiction.
-    """
-    found = str(_value(file.attrs.get("schema", "none")))
-    if found != schema.name:
-        raise _Contradiction(f"holds schema {found!r}, expected {schema.name!r}")
-    version = file.attrs.get("schema_version", 0)
-    if not isinstance(version, int | np.integer):
-        raise _Contradiction(f"attribute 'schema_version' is {version!r}, expected a whole number")
-    if version != schema.version:
-        raise _Contradiction(
-            f"schema {schema.name!r} has version {version}, this program reads version "
-            f"{schema.version}"
-        )
-    complete = file.attrs.get("complete", False)
-    if not isinstance(complete, bool | np.bool_) or not complete:
-        raise _Contradiction("was never finished (no 'complete' mark)")
-    for name in schema.attributes:
-        if name not in file.attrs:
-            raise _Contradiction(f"attribute {name!r} is missing")
-    lengths: dict[str, int] = {}
-    datasets = {}
-    for key, declared in schema.fields.items():
-        dataset = None if "{camera}" in key else file.get(key)
-        if dataset is not None:
-            _check_dataset(dataset, key, declared, lengths)
-            datasets[key] = dataset
-        elif "{camera}" not in key and not declared.optional:
-            raise _Contradiction(f"dataset {key!r} is missing")
-    return datasets
-
-
-def _check_dataset(
-    dataset: h5py.Dataset, key: str, declared: Field, lengths: dict[str, int]
-) -> None:
-    """Raise _Contradiction unless a dataset has the declared type and shape."""
-    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
-        raise _Contradiction(f"{key!r} holds no values, expected a dataset")
-    text = declared.dtype == "str"
-    if (text and dataset.dtype.kind != "S") or (
-        not text and dataset.dtype != np.dtype(declared.dtype)
-    ):
-        raise _Contradiction(f"dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}")
-    if _declares_too_much(dataset):
-        raise _Contradiction(f"dataset {key!r} has shape {dataset.shape}, but too few bytes")
-    _check_shape(key, declared, dataset.shape, lengths)
-
-
-def _declares_too_much(dataset: h5py.Dataset) -> bool:
-    """Whether a dataset's size exceeds what its stored bytes can unpack to.
-
-    The rest would be fill values, which take unbounded memory or time to read.
-    """
-    size = dataset.nbytes
-    return bool(size > _CHECKED_BYTES and size > _MAX_RATIO * dataset.id.get_storage_size())
 
 
 def pack_ragged(items: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ reads both; ``intercap_core.posed.open_sequence`` returns vertices and joints.
 
 from __future__ import annotations
 
-from intercap_core.artefacts import Field, Schema
+from intercap_core.artefact_schema import Field, Schema
 
 CONTACT_M = 0.0045  # distance of contact; the paper's threshold, "Contact Heatmaps"
 CONTACT_REGIONS = (

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from intercap_core import artefacts, schemas
-from intercap_core.artefacts import Field, Schema, Unreadable, pack_ragged, unpack_ragged
+from intercap_core.artefact_schema import Field, Schema
+from intercap_core.artefacts import Unreadable, pack_ragged, unpack_ragged
 
 SCHEMA = Schema(
     name="trial",

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from intercap_core import schemas
 from intercap_core.annotation import Annotation
-from intercap_core.artefacts import Schema
+from intercap_core.artefact_schema import Schema
 from intercap_core.config import Config
 from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 

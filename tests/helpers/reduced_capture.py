@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts, schemas
-from intercap_core.artefacts import Artefact, Schema, Writer, pack_ragged, unpack_ragged
+from intercap_core.artefact_schema import Schema
+from intercap_core.artefacts import Artefact, Writer, pack_ragged, unpack_ragged
 
 STAGES = {
     s.name: s

@@ -30,7 +30,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from intercap_core import artefacts
-from intercap_core.artefacts import Field, Schema
+from intercap_core.artefact_schema import Field, Schema
 from intercap_core.disk import fault_in
 schema = Schema("some", 1, "frames", {"rows": Field(("T", "100"), "float64", "noise")})
 values = np.random.default_rng(0).random((20, 100))
@@ -60,7 +60,7 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from intercap_core import artefacts, disk
-from intercap_core.artefacts import Field, Schema
+from intercap_core.artefact_schema import Field, Schema
 from intercap_core.signals import Terminated, raise_on_signals
 schema = Schema("some", 1, "frames", {"rows": Field(("T", "5000"), "float64", "noise")})
 

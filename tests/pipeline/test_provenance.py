@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.artefacts import Field, Schema
+from intercap_core.artefact_schema import Field, Schema
 from intercap_core.pipeline import stage_inputs
 from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.pipeline.provenance import (

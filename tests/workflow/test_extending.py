@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.artefacts import Field, Schema
+from intercap_core.artefact_schema import Field, Schema
 from tests.helpers.extending import apply_chapter
 from tests.helpers.flow import ONE, Flow
 
