@@ -19,7 +19,10 @@ from intercap_core.inputs.files import describe_unread
 # that folder). A folder stands for all files below it.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.[mM][kK][vV]",),
-    "ros": ("*.bag", "*.mcap", "*.db3", "*/*.mcap", "*/*.db3"),
+    "ros": (
+        *("*.bag", "*.bag.active", "*.mcap", "*.db3", "metadata.yaml"),
+        *("*/*.mcap", "*/*.db3", "*/metadata.yaml"),
+    ),
     "intercap": ("[fF][rR][aA][mM][eE][sS]_[cC][aA][mM]*/*",),
     "behave": ("",),
     "plain": (
@@ -38,7 +41,7 @@ _DEEPEST = 3  # levels of folders below the recordings that are searched
 _READ: dict[LayoutName, tuple[str, str]] = {
     "k4a": (r"[^/]+\.mkv", "<camera>.mkv"),
     "ros": (
-        r"[^/]+\.bag|([^/]+/)?[^/]+\.(mcap|db3)",
+        r"[^/]+\.bag(\.active)?|([^/]+/)?[^/]+\.(mcap|db3)",
         "<camera>.bag (.mcap, .db3), a bag of several cameras, or bag folders of ROS 2",
     ),
     "intercap": (
@@ -114,7 +117,10 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
             for pattern in INPUTS[sequence.layout]
             for path in (folder.glob(pattern) if pattern else [folder])
             if not path.name.startswith(".")
-            and (path.suffix.lower() not in _NO_RECORDINGS or path.stem.endswith("timestamps"))
+            and (
+                path.suffix.lower() not in _NO_RECORDINGS
+                or path.stem.endswith(("timestamps", "metadata"))
+            )
         }
     )
 

@@ -18,11 +18,13 @@ from intercap_core.formats.recordings.source import ClosedOnExit
 if TYPE_CHECKING:
     from rosbags.interfaces import TopicInfo
 
-SUFFIXES = (".bag", ".mcap", ".db3")
+ACTIVE = ".active"  # rosbag record appends it until a bag has its index
+SUFFIXES = (".bag", f".bag{ACTIVE}", ".mcap", ".db3")
 METADATA = "metadata.yaml"  # of a bag folder of ROS 2
 # Command that restores a file without an index or an end.
 _REPAIR = {
     ".bag": "rosbag reindex FILE",
+    ACTIVE: f"rosbag reindex FILE, then remove {ACTIVE} from its name",
     ".mcap": "mcap recover FILE -o REPAIRED",
     ".db3": "sqlite3 FILE .recover",
     "": "ros2 bag reindex FOLDER",
@@ -65,7 +67,7 @@ class Bag(ClosedOnExit):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._is_ros1 = path.suffix == ".bag"
+        self._is_ros1 = path.suffix in (".bag", ACTIVE)
         _require_package(path)
         self._store = _type_store(self._is_ros1)
         with self._explained():
@@ -131,15 +133,28 @@ def find_bags(folder: Path) -> list[Path]:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path has the form of a bag; its content is not read."""
+    """Return whether a path has the form of a bag; its content is not read.
+
+    ``ros2 bag record`` names files after their folder, and writes ``METADATA`` when it ends.
+    """
     if path.is_dir():
-        return (path / METADATA).is_file()
-    return path.suffix in SUFFIXES
+        first = (f"{path.name}_0.mcap", f"{path.name}_0.db3")
+        names = (METADATA, *first, *(f"{name}.zstd" for name in first))
+        return any((path / name).is_file() for name in names)
+    return path.name.endswith(SUFFIXES)
+
+
+def name_of(path: Path) -> str:
+    """Name of a bag without its suffix."""
+    return Path(path.name.removesuffix(ACTIVE)).stem
 
 
 def _open_reader(path: Path, is_ros1: bool) -> Any:
     from rosbags import rosbag1, rosbag2
 
+    if path.is_dir() and not (path / METADATA).is_file():  # of an interrupted recording
+        parts = [part for part in path.iterdir() if part.suffix in SUFFIXES]
+        path = parts[0] if len(parts) == 1 else path
     reader = rosbag1.Reader(path) if is_ros1 else rosbag2.Reader(path)
     reader.open()
     return reader

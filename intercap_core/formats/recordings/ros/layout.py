@@ -26,7 +26,7 @@ from intercap_core.formats.calibration.files import (
 from intercap_core.formats.calibration.opencv import CalibratedCamera, check_rate
 from intercap_core.formats.recordings.encodings import DamagedImage, encoded_size
 from intercap_core.formats.recordings.ros import orbbec, realsense, standard
-from intercap_core.formats.recordings.ros.bag import Bag, find_bags, is_bag
+from intercap_core.formats.recordings.ros.bag import Bag, find_bags, is_bag, name_of
 from intercap_core.formats.recordings.ros.images import decode_colour, decode_depth
 from intercap_core.formats.recordings.ros.lenses import STATIC_TRANSFORMS, StaticTransforms
 from intercap_core.formats.recordings.ros.streams import (
@@ -85,7 +85,7 @@ def _find_places(recordings: Path) -> dict[str, _Place]:
         except UserError as error:
             names, fault = [""], str(error)
         for name in names:
-            own = name if name and (len(bags) == 1 or len(names) > 1) else path.stem
+            own = name if name and (len(bags) == 1 or len(names) > 1) else name_of(path)
             check_camera_name(path, own)
             if own in places:
                 raise UserError(

@@ -12,7 +12,11 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from intercap_core.config import FramesSettings
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.layouts import open_layout, recognise_recordings
+from intercap_core.formats.recordings.layouts import (
+    input_files,
+    open_layout,
+    recognise_recordings,
+)
 from intercap_core.stages import frames
 from tests.formats.recordings.ros.test_standard import place_of, row
 from tests.helpers.kinect_files import notes_of
@@ -131,6 +135,39 @@ def test_a_cut_file_is_named_with_its_repair(tmp_path: Path, form: Form, share: 
         for camera in layout.names:
             with layout.open(camera) as recording:
                 list(recording.images())
+
+
+def test_an_interrupted_recording_is_named_with_its_repair(tmp_path: Path) -> None:
+    """Recorders that are killed leave a bag folder without metadata, and ``.bag.active``."""
+    for name in ("cut", "split", "whole"):
+        with BagFile(tmp_path / name, "mcap") as bag:
+            write_camera(bag)
+        (tmp_path / name / "metadata.yaml").unlink()
+        (tmp_path / name / f"{name}.mcap").rename(tmp_path / name / f"{name}_0.mcap")
+    with BagFile(tmp_path / "active.bag.active", "bag") as bag:
+        write_camera(bag)
+    for file, change in (
+        ("cut/cut_0.mcap", lambda c: c[:-99]),
+        ("active.bag.active", without_index),
+    ):
+        (tmp_path / file).write_bytes(change((tmp_path / file).read_bytes()))
+    (tmp_path / "split/split_1.mcap").touch()
+    names = ["active", "cut", "split", "whole"]
+    assert recognise_recordings(tmp_path) == ("ros", names)
+    layout = open_layout(row(tmp_path, calibration=rig_file(tmp_path, *names)))
+    for name, words in (
+        ("active", r"active\.bag\.active: .*rosbag reindex FILE, then"),
+        ("cut", r"/cut: .*ros2 bag reindex FOLDER"),
+        ("split", r"/split: .*ros2 bag reindex FOLDER"),
+    ):
+        with pytest.raises(UserError, match=words):
+            layout.open(name)
+    with layout.open("whole") as recording:
+        assert len(list(recording.images())) == 8
+    watched = {path.name for path in input_files(row(tmp_path))}
+    assert {"active.bag.active", "cut_0.mcap"} <= watched
+    (tmp_path / "cut/metadata.yaml").touch()
+    assert tmp_path / "cut/metadata.yaml" in input_files(row(tmp_path))
 
 
 def test_other_files_are_named(tmp_path: Path) -> None:
