@@ -102,19 +102,23 @@ def _run_parameters(module: str) -> tuple[str, ...]:
 
 
 def _package_checksum() -> str:
-    """Checksum of the package's code, and of the size and date of its data files."""
+    """Checksum of the package's code, and of the size and date of its data files.
+
+    Copies of the package in other folders have the same checksum.
+    """
     state = hashlib.sha256()
     for folder, folders, names in os.walk(ROOT):
         folders[:] = sorted(name for name in folders if name != "__pycache__")
-        is_data = any(part in DATA_FOLDERS for part in Path(folder).relative_to(ROOT).parts)
+        relative = Path(folder).relative_to(ROOT)
+        is_data = any(part in DATA_FOLDERS for part in relative.parts)
         for name in sorted(names):
             path = Path(folder, name)
             if is_data:
                 stat = path.stat()
-                state.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+                state.update(f"{relative / name} {stat.st_size} {stat.st_mtime_ns}\n".encode())
             elif name.endswith(".py"):
                 text = path.read_bytes()
-                state.update(f"{PACKAGE} {path} {len(text)}\n".encode())
+                state.update(f"{relative / name} {len(text)}\n".encode())
                 state.update(text)
     return state.hexdigest()[:24]
 
@@ -211,18 +215,47 @@ def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
 def _statements(path: Path, mtime_ns: int, root: Path) -> tuple[_Statement, ...]:
     """Top-level statements of a module; ``mtime_ns`` invalidates the cache after an edit."""
     tree = ast.parse(path.read_bytes(), str(path))
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [entry for entry in body if not _is_text(entry)]  # type: ignore[attr-defined]
-    return tuple(
-        _Statement(
-            ast.dump(node).encode(),
-            frozenset(_defines(node)),
-            frozenset(_uses(node)),
-            tuple(_imports(node, root)),
-        )
-        for node in tree.body
+    return tuple(_statement(node, root) for node in tree.body if not _is_text(node))
+
+
+def _statement(statement: ast.stmt, root: Path) -> _Statement:
+    """Read a statement in one pass over its syntax tree."""
+    content: list[str] = []
+    uses: set[str] = set()
+    imports: list[tuple[str, str]] = []
+
+    def read(node: ast.AST) -> None:
+        kind = type(node)
+        content.append(kind.__name__)
+        if kind is ast.Name:
+            uses.add(node.id)  # type: ignore[attr-defined]
+        elif kind is ast.Constant and isinstance(node.value, str):  # type: ignore[attr-defined]
+            uses.add(node.value)  # type: ignore[attr-defined]  # annotations may be strings
+        elif kind in _IMPORTING:
+            imports.extend(_imports(node, root))
+        for name in node._fields:
+            value = getattr(node, name, None)
+            # the context (load, store) follows from the other fields; versions of Python differ in
+            # fields that are empty
+            if name == "ctx" or value is None or value == []:
+                continue
+            content.append(name)
+            if isinstance(value, list):
+                content.append("[")
+                for entry in value:
+                    if not isinstance(entry, ast.AST):
+                        content.append(repr(entry))
+                    elif name != "body" or not _is_text(entry):
+                        read(entry)
+                content.append("]")
+            elif isinstance(value, ast.AST):
+                read(value)
+            else:
+                content.append(repr(value))
+
+    read(statement)
+    return _Statement(
+        "\n".join(content).encode(), frozenset(_defines(statement)), frozenset(uses), tuple(imports)
     )
 
 
@@ -246,38 +279,28 @@ def _defines(statement: ast.stmt) -> set[str]:
     return set()
 
 
-def _uses(statement: ast.stmt) -> set[str]:
-    """Names that a statement mentions, and all texts in it."""
-    names = set()
-    for node in ast.walk(statement):
-        if isinstance(node, ast.Name):
-            names.add(node.id)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            names.add(node.value)  # annotations may be strings
-    return names
+_IMPORTING = (ast.Import, ast.ImportFrom, ast.Call)  # nodes of which _imports finds modules
 
 
-def _imports(node: ast.stmt, root: Path) -> list[tuple[str, str]]:
-    """Pairs (module, name) that a statement imports from the package, with parent packages.
+def _imports(node: ast.AST, root: Path) -> list[tuple[str, str]]:
+    """Pairs (module, name) that a node imports from the package, with parent packages.
 
     No import in the package is relative (ruff's rule TID252).
     ``from a import b`` counts both as the name b of module a and as a module a.b, if that exists.
     """
+    targets: list[tuple[str, str]] = []
+    if isinstance(node, ast.Import):
+        targets = [(alias.name, WHOLE) for alias in node.names]
+    elif isinstance(node, ast.ImportFrom):
+        targets = [(str(node.module), alias.name) for alias in node.names]
+        targets += [(f"{node.module}.{alias.name}", WHOLE) for alias in node.names]
+    elif isinstance(node, ast.Call):
+        targets = [(name, WHOLE) for name in _discovered(node, root)]
     found: list[tuple[str, str]] = []
-    for inner in ast.walk(node):
-        if isinstance(inner, ast.Import):
-            targets = [(alias.name, WHOLE) for alias in inner.names]
-        elif isinstance(inner, ast.ImportFrom):
-            targets = [(str(inner.module), alias.name) for alias in inner.names]
-            targets += [(f"{inner.module}.{alias.name}", WHOLE) for alias in inner.names]
-        elif isinstance(inner, ast.Call):
-            targets = [(name, WHOLE) for name in _discovered(inner, root)]
-        else:
-            continue
-        for name, used in targets:
-            if _exists(name, root):
-                found.append((name, used))
-                found += [(parent, WHOLE) for parent in _parents(name)]
+    for name, used in targets:
+        if _exists(name, root):
+            found.append((name, used))
+            found += [(parent, WHOLE) for parent in _parents(name)]
     return found
 
 

@@ -25,11 +25,12 @@ COPIED = ("workflow", "config", "intercap_core", EXECUTOR)
 KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache next to the source
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
 # Appended to a stage of a copy, which then returns the result of a finished run. Its imports
-# and signature stay, so that its code digest and arguments are the real ones.
+# and signature stay, so that its code digest and arguments are the real ones. The text is the same
+# in all copies, so that the digests of the code are computed once.
 REPLAY = """
 
 def _replayed(real):
-    import functools, importlib, shutil, time
+    import functools, importlib, json, shutil, time
     from pathlib import Path
 
     @functools.wraps(real)
@@ -42,9 +43,10 @@ def _replayed(real):
                 with artefacts.read(path, getattr(schemas, name.upper())) as source:
                     for key in source.keys():
                         source[key]
-        time.sleep({pause_s})
+        settings = json.loads(Path("replay.json").read_text())
+        time.sleep(settings["pause_s"])
         place = output.parent.resolve().relative_to(Path("results/test").resolve())
-        folder = Path({results!r}) / place
+        folder = Path(settings["results"]) / place
         made = next(p for p in folder.iterdir() if output.name.startswith("." + p.name + "."))
         (shutil.copytree if made.is_dir() else shutil.copy)(made, output)
 
@@ -116,10 +118,11 @@ class Flow:
             else:
                 shutil.copy2(source, folder / name)
         if replay is not None:
-            text = REPLAY.format(results=str(replay), pause_s=pause_s)
+            settings_of_replay = {"results": str(replay), "pause_s": pause_s}
+            (folder / "replay.json").write_text(json.dumps(settings_of_replay))
             for stage in REPLAYED:
                 with (folder / "intercap_core" / "stages" / f"{stage}.py").open("a") as module:
-                    module.write(text)
+                    module.write(REPLAY)
             lease = folder / "intercap_core" / "pipeline" / "lease.py"
             usual = lease.read_text()
             short = usual.replace("BEAT_S = 5.0", "BEAT_S = 1.0").replace(
