@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.scan.fusion import Posed, vertex_colours
 from intercap_core.scan.proposal import ProposedSymmetry, propose_symmetry, standing_frame
 from intercap_core.scan.volume import ClosedSurface

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.clouds import colour_lookup
 from intercap_core.geometry.camera.rig import ring_centre
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.scan.fusion import Posed
 from intercap_core.scan.surfaces import ViewSurface, connected_parts
 from intercap_core.scan.walk import HandHeld, Walk

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -25,6 +24,7 @@ from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.schemas import PERSON, SCENE
 
 UNKNOWN, OBJECT, OTHER = 0, 1, 2  # what a pixel shows

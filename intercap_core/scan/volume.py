@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import igl
 import numba
 import numpy as np
-import open3d as o3d
 import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.scan.surfaces import OBJECT, UNKNOWN
 
 # Largest distance before and behind a measured surface that is averaged. Both are equal, because

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 
 from intercap_core import artefacts
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import rotation_exp, rotation_log
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.geometry.solve.time_series import runs
 from intercap_core.inputs.documents import dump_yaml
 from intercap_core.progress import Progress

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
-import open3d as o3d
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.studio.noise import gaussian

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
@@ -17,6 +16,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.project import load_project
 from intercap_core.scan.standing import find_standing
 from intercap_core.scan.walk import HandHeld, Walk, follow

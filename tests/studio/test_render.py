@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.geometry.camera.transforms import apply, invert, rigid, rotation_exp
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.studio.render import (
     BODY,
     OBJECT,

@@ -12,16 +12,13 @@ is missing at the holes.
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import dataclass
-from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
-from pathlib import Path
 from typing import Any
 
 import igl
 import numpy as np
+
+from intercap_core.geometry.rigid.open3d_core import o3d
 
 # Directions of rays whose crossings are counted. A point is outside if the first ray has an even
 # number of crossings (no error on 10,000 points). Else all five vote, since a ray may pass along an
@@ -31,43 +28,6 @@ _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
 )  # fmt: skip
-_OPEN3D_CORE = "open3d.cpu.pybind"
-
-
-def _load_open3d() -> Any:
-    """Return the compiled core of a CPU build of Open3D; for other builds the whole package.
-
-    ``import open3d`` takes 1.7 s, of which 1.3 s are for scikit-learn, pandas and dash, which are
-    not used here. The core has the same ``core``, ``t``, ``geometry`` and ``utility``, and the
-    whole package can still be imported afterwards.
-    """
-    if _OPEN3D_CORE in sys.modules:
-        return sys.modules[_OPEN3D_CORE]
-    package = find_spec("open3d")
-    folders = list(package.submodule_search_locations or ()) if package else []
-    files = [
-        path
-        for folder in folders
-        for suffix in EXTENSION_SUFFIXES
-        for path in Path(folder, "cpu").glob(f"pybind*{suffix}")
-    ]
-    gpu_build = any(Path(folder, "cuda").is_dir() for folder in folders)
-    if not files or gpu_build or "open3d" in sys.modules:
-        import open3d
-
-        return open3d
-    # the package sets these variables before it loads the same file
-    os.environ["KMP_DUPLICATE_LIB_OK"] = "True"
-    os.environ["TCM_ENABLE"] = "1"
-    spec = spec_from_file_location(_OPEN3D_CORE, files[0])
-    assert spec is not None and spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[_OPEN3D_CORE] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-o3d = _load_open3d()
 
 
 @dataclass(frozen=True)

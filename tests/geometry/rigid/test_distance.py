@@ -111,12 +111,12 @@ def test_a_single_vertex_spans_the_faces_around_it():
 
 CORE_FIRST = """
 import sys, intercap_core.stages.object_track
-from intercap_core.geometry.rigid.distance import o3d as ours
+from intercap_core.geometry.rigid.open3d_core import o3d as ours
 assert not {"sklearn", "pandas", "dash", "matplotlib", "torch", "open3d"} & set(sys.modules)
 import open3d
 assert open3d.t.geometry.RaycastingScene is ours.t.geometry.RaycastingScene
 """
-WHOLE_FIRST = "import open3d; from intercap_core.geometry.rigid.distance import o3d as ours"
+WHOLE_FIRST = "import open3d; from intercap_core.geometry.rigid.open3d_core import o3d as ours"
 
 
 @pytest.mark.parametrize("code", [CORE_FIRST, WHOLE_FIRST])

@@ -1,13 +1,13 @@
 """Rendering against closed forms, projected vertices and an independent ray caster."""
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.geometry.rigid.render import (
     Renderer,
     default_renderer,

@@ -9,9 +9,9 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-import open3d as o3d
 
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.studio.subjects import Subject
 
 VERTICES = 6890

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 
 from intercap_core import artefacts
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.open3d_core import o3d
 from intercap_core.output.export import meshes
 from intercap_core.output.export.motion import read_motion
 from intercap_core.output.export.silhouettes import Scenes
