@@ -27,7 +27,7 @@ def _protruding(
     """
     depth = np.full((288, 320), background_mm, np.uint16)
     depth[:, :200] = person_mm
-    window = DepthWindow(0, (30, 20), depth[30:250, 20:300])
+    window = DepthWindow(0, (30, 20), depth[30:250, 20:300].copy())
     local = np.stack([np.full(9, x), np.linspace(-0.3, 0.3, 9), np.full(9, 2.0)], 1)
     points = apply(CAMERA.master_from_depth, local)
     normals = np.tile(CAMERA.master_from_depth[:3, :3] @ normal, (9, 1))

@@ -20,6 +20,8 @@ from intercap_core.geometry.rigid.triangle_kernels import (
     squared_distance,
 )
 
+# Kernels start at face np.int64(0): for the literal 0, numba compiles the functions that they call
+# a second time.
 _ROUNDING = 1e-6  # error of distances in single precision, metres
 _ON_SURFACE = 1e-4  # distance below which a face's normal replaces the direction to it, metres
 # Least cosine between a normal and the direction to a point that the surface faces. The normal of a
@@ -37,7 +39,7 @@ def nearest(points, triangles, boxes, levels, reach_sq):
     """
     squared = np.empty(len(points), np.float32)
     stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
-    last = 0
+    last = np.int64(0)
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
         squared[m], last = _search(
@@ -60,7 +62,7 @@ def signed_distances(points, triangles, boxes, levels, reach, deepest):
     """
     signed = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
-    last, within = 0, False
+    last, within = np.int64(0), False
     # centre and radius of a ball whose side, ``within``, is known
     cx, cy, cz, clear = np.inf, np.inf, np.inf, -np.inf
     reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
@@ -96,7 +98,7 @@ def hit(starts, ends, triangles, boxes, levels, first, shares):
     """
     leaves, count = 1 << levels, len(triangles)
     stack = np.empty(levels + 2, np.int32)
-    last = 0
+    last: int | np.int64 = np.int64(0)
     for m in range(len(starts)):
         if shares[m] < np.inf:
             continue
@@ -186,7 +188,7 @@ def oppose(points, normals, signed, triangles, boxes, levels, reach):
     kind, away = np.zeros(count, np.int8), np.full(count, np.inf)
     found = np.full((count, 3), np.nan)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
-    last, most = 0, np.float32(np.inf)
+    last, most = np.int64(0), np.float32(np.inf)
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
         nx, ny, nz = normals[m, 0], normals[m, 1], normals[m, 2]
