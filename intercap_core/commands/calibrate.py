@@ -50,6 +50,10 @@ def calibrate(
     parsed_board = None if board is None else parse_board(board)
     parsed_distance = None if distance is None else _parse_distance(distance)
     draft = draft_rig(row, lenses, master)
+    for name in parsed_distance[:2] if parsed_distance else ():
+        if name not in draft.names:
+            known = ", ".join(draft.names)
+            raise UserError(f"--distance names camera {name!r}; expected one of {known}")
     used = project.config.frames.cameras
     left_out = [name for name in draft.names if used and name not in used]
     if left_out:
