@@ -53,13 +53,15 @@ def test_noise_and_a_missing_handle_appear_in_the_distances() -> None:
     truth = Mesh(vertices, faces)
     noise = np.random.default_rng(1).normal(0, 0.0005, vertices.shape)
     noisy = Mesh(vertices + noise, faces).moved(MOVED)
-    errors = _errors(noisy, truth)
+    aligned = noisy.moved(align(noisy, truth))
+    errors = ScanErrors("cup", *distances(aligned, truth), aligned.is_watertight)
     assert errors.watertight
     assert 0.0001 < errors.chamfer < 0.0006
     handle = (vertices[faces][:, :, 0] > 0.042).any(1)
-    rest = trimesh.Trimesh(noisy.vertices, faces[~handle])
+    rest = trimesh.Trimesh(aligned.vertices, faces[~handle])
     rest.fill_holes()
-    without = _errors(Mesh(np.asarray(rest.vertices), np.asarray(rest.faces)), truth)
+    closed = Mesh(np.asarray(rest.vertices), np.asarray(rest.faces))
+    without = ScanErrors("cup", *distances(closed, truth))
     assert without.to_scan.max() > 0.02 > 0.005 > without.to_truth.max()
     assert without.to_scan.mean() > 1.5 * errors.to_scan.mean()
 
