@@ -255,7 +255,8 @@ def test_blocks_change_neither_observations_nor_covariances(model, clothed, monk
         monkeypatch.setattr(module, "BLOCK_FRAMES", 2)
     for name, values in observed().items():
         expected = whole[name].numpy()
-        atol = 1e-5 * np.nanmax(np.abs(expected))  # single precision
+        # Single precision. Normals are of edges of 1 mm between vertices rounded to 0.2 um.
+        atol = 5e-4 if name == "normal" else 1e-5 * np.nanmax(np.abs(expected))
         np.testing.assert_allclose(values.numpy(), expected, rtol=1e-4, atol=atol, err_msg=name)
 
 
