@@ -147,7 +147,7 @@ def _scan_turned(
         shown = [find_handled(recording, name) for recording in recordings]
         if improve:
             parts = [
-                Posed(r, views, _poses(run_step("object_track", project, sequence, keep=True)))
+                Posed(r, views, *_poses(run_step("object_track", project, sequence, keep=True)))
                 for r, views, sequence in zip(recordings, shown, sequences, strict=True)
             ]
             return finish(fuse(parts), parts, None)
@@ -237,7 +237,7 @@ def _scan(
         for recording, views in zip(recordings, shown, strict=True):
             known = sure if recording is recordings[0] else []
             track = _track(project, recording, entry, known, places)
-            parts.append(Posed(recording, views, _poses(track)))
+            parts.append(Posed(recording, views, *_poses(track)))
             _require_poses(parts[-1], name)
         poses = {seed: poses[seed]} | dict(parts[0].poses)
         last = round_ == ROUNDS - 1
@@ -279,12 +279,17 @@ def _track(
     return output
 
 
-def _poses(track: Path) -> dict[int, np.ndarray]:
-    """Poses master_from_object (4, 4) of the frame sets in which the object is not lost."""
+def _poses(track: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """Poses master_from_object (4, 4) and their covariances (6, 6) by frame set.
+
+    Frame sets in which the object is lost are left out.
+    """
     with artefacts.read(track, OBJECT_TRACK) as source:
         rotation, translation = source["rotation"], source["translation"]
+        covariance = source["covariance"]
         sure = ~(source["lost"] | source["gone"]) & np.isfinite(translation).all(1)
-    return {int(t): rigid(rotation[t], translation[t]) for t in np.flatnonzero(sure)}
+    sets = np.flatnonzero(sure).tolist()
+    return {t: rigid(rotation[t], translation[t]) for t in sets}, {t: covariance[t] for t in sets}
 
 
 def _require_poses(part: Posed, name: str) -> None:

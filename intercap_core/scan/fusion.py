@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from intercap_core.scan.surfaces import (
     ViewSurface,
     floating,
 )
-from intercap_core.scan.volume import ClosedSurface, LabelledDepth, Volume
+from intercap_core.scan.volume import NOISE_M, ClosedSurface, LabelledDepth, Volume
 
 MIN_COSINE = 0.25  # of the angle between a ray and the normal; flatter measurements mix surfaces
 SAME_SURFACE_M = 0.015  # difference of neighbouring depths on one surface
@@ -43,11 +43,18 @@ class Posed:
     """Points that show the object, by frame set."""
     poses: Mapping[int, np.ndarray]
     """master_from_object (4, 4) by frame set."""
+    covariances: Mapping[int, np.ndarray] = field(default_factory=dict)
+    """Covariance (6, 6) of (rotation vector, translation) by frame set, rad and metres, rotation
+    applied on the left. Poses without one count as exact."""
 
     @property
     def sets(self) -> list[int]:
         """Frame sets with a pose and points of the object."""
         return sorted(self.poses.keys() & self.surfaces.keys())
+
+    def covariance(self, t: int) -> np.ndarray:
+        """Covariance (6, 6) of the pose of a frame set; zero if none is known."""
+        return self.covariances.get(t, np.zeros((6, 6)))
 
     def points(self, t: int) -> np.ndarray:
         """Points (N, 3) of all cameras in the object's frame."""
@@ -82,43 +89,62 @@ def fuse(
     box = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     for part in parts:
         for t in part.sets[:: max(1, len(part.sets) // FUSED_SETS)]:
-            volume.sets += 1
             views = {view.camera: view for view in part.surfaces[t]}
-            for c in part.recording.cameras:
-                image = _labelled(part.recording, t, c, views.get(c), part.poses[t], box)
-                if image is not None:
-                    if up is not None and ground is not None:
-                        _label_ground(image, up, ground)
-                    volume.integrate(image)
+            images = [_labelled(part, t, c, views.get(c), box) for c in part.recording.cameras]
+            shown = [image for image in images if image is not None]
+            if up is not None and ground is not None:
+                for image in shown:
+                    _label_ground(image, up, ground)
+            volume.integrate(shown, place_variance(part.poses[t], part.covariance(t)))
     if up is not None:
         if ground is None:
             ground = float(np.percentile(points @ up, LOWEST))
         volume.exclude_below(up, ground)
     surface = volume.surface()
     if not len(surface.faces):
-        shown = ", ".join(part.recording.frames.sequence for part in parts)
+        sequences = ", ".join(part.recording.frames.sequence for part in parts)
         raise UserError(
-            f"sequence {shown}: the depth images leave no surface of the object, in {volume.sets} "
+            f"sequence {sequences}: the depth images leave no surface of the object, in {volume.sets} "
             "frame sets with a pose of it; turn it more slowly, and nearer to the cameras"
         )
     return surface
 
 
+def place_variance(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Quadratic form Q (4, 4) of the variance of the object's points under an uncertain pose.
+
+    (x, 1) Q (x, 1)' is the variance of the point x of the object's frame in the master frame, square
+    metres, averaged over the three directions.
+
+    Args:
+        pose: (4, 4) master_from_object.
+        covariance: (6, 6) of (rotation vector, translation), rotation applied on the left.
+    """
+    turn, mixed, shift = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
+    # of the displacement w x r + v of the point r = R x: trace of its covariance
+    form = np.zeros((4, 4))
+    form[:3, :3] = np.trace(turn) * np.eye(3) - turn
+    # E[v . (w x r)] = r . E[v x w]
+    form[:3, 3] = form[3, :3] = (mixed.T - mixed)[[1, 2, 0], [2, 0, 1]]
+    form[3, 3] = np.trace(shift)
+    rotation = np.eye(4)
+    rotation[:3, :3] = pose[:3, :3]
+    return rotation.T @ form @ rotation / 3
+
+
 def _labelled(
-    recording: DepthImages,
-    t: int,
-    c: int,
-    view: ViewSurface | None,
-    pose: np.ndarray,
-    box: np.ndarray,
+    part: Posed, t: int, c: int, view: ViewSurface | None, box: np.ndarray
 ) -> LabelledDepth | None:
     """The window of a depth image that shows the object's box; None without an image of it.
 
     Args:
+        part: recording with poses of the object.
+        t: frame set.
+        c: camera.
         view: points that show the object in this image; None if there are none.
-        pose: (4, 4) master_from_object.
         box: (8, 3) corners around the object, its frame.
     """
+    recording, pose = part.recording, part.poses[t]
     depth, camera = recording.depth(t, c), recording.rig[c]
     lens = camera.depth
     if depth is None or lens is None:
@@ -138,7 +164,9 @@ def _labelled(
         towards = camera.master_from_depth[:3, 3] - view.points
         cosine = (towards * view.normals).sum(1) / np.linalg.norm(towards, axis=1)
         kind.ravel()[view.pixels[cosine > MIN_COSINE]] = OBJECT
-        weight.ravel()[view.pixels] = cosine**2
+        arms = np.concatenate([np.cross(view.points - pose[:3, 3], view.normals), view.normals], 1)
+        variance = np.einsum("ni,ij,nj->n", arms, part.covariance(t), arms)  # along the normals
+        weight.ravel()[view.pixels] = cosine**2 * NOISE_M**2 / (NOISE_M**2 + variance)
     depth = cv2.bilateralFilter(depth, 5, SAME_SURFACE_M, 2.0)  # averages about ten pixels
     # a pinhole image of the box, so that each voxel is projected by two divisions
     rays = local[:, :2] / local[:, 2:]

@@ -2,12 +2,13 @@
 
 As in volumetric fusion (Curless and Levoy, SIGGRAPH 1996), each voxel averages the signed distances
 along the rays of all images. Votes for empty space are counted apart, so that rays that pass a thin
-part do not erode it. Voxels that no ray reached count as inside, which closes the surface with the
-visual hull.
+part do not erode it. Both are weighted by the certainty of the object's pose. Voxels that no ray
+reached count as inside, which closes the surface with the visual hull.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import igl
@@ -26,7 +27,8 @@ BAND_M = 0.010
 # more than those of the other side. Noise of depth and poses, metres.
 NOISE_M = 0.003
 EMPTY_RATIO = 4.0  # a voxel is empty if its votes for empty space outnumber the others by this
-MIN_EMPTY = 3  # least votes of an empty voxel: single depth pixels are wrong
+# Least votes of an empty voxel, of frame sets of mean certainty: single depth pixels are wrong
+MIN_EMPTY = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,30 +69,43 @@ class Volume:
         self.voxel_m = voxel_m
         self.low = np.asarray(low, float)
         self.size = tuple((np.ceil((high - low) / voxel_m).astype(int) + 1).tolist())
-        self.sets = 0  # frame sets that were integrated
+        self._middle = np.append((self.low + high) / 2, 1.0)
+        self._certainties: list[float] = []  # of the frame sets, in the middle of the box
         self._distance = np.zeros(self.size, np.float32)  # sum of weight * distance
         self._total = np.zeros(self.size, np.float32)  # sum of weight
         self._near = np.zeros(self.size, np.float32)  # votes near a surface
         self._empty = np.zeros(self.size, np.float32)  # votes for empty space
 
-    def integrate(self, image: LabelledDepth) -> None:
-        """Add the votes of one depth image."""
-        _integrate(
-            self._distance, self._total, self._near, self._empty, self.low, self.voxel_m,
-            image.depth, image.kind, image.weight, image.pinhole, image.depth_from_object,
-        )  # fmt: skip
+    @property
+    def sets(self) -> int:
+        """Number of frame sets that were integrated."""
+        return len(self._certainties)
+
+    def integrate(self, images: Iterable[LabelledDepth], variance: np.ndarray) -> None:
+        """Add the votes of the depth images of a frame set.
+
+        ``variance``: (4, 4) of the object's points, of :func:`.place_variance`.
+        """
+        for image in images:
+            _integrate(
+                self._distance, self._total, self._near, self._empty, self.low, self.voxel_m,
+                image.depth, image.kind, image.weight, image.pinhole, image.depth_from_object,
+                variance,
+            )  # fmt: skip
+        self._certainties.append(BAND_M**2 / (BAND_M**2 + self._middle @ variance @ self._middle))
 
     def exclude_below(self, normal: np.ndarray, offset: float) -> None:
         """Mark the voxels with normal . x < offset as empty."""
         axes = [self.low[k] + self.voxel_m * np.arange(n) for k, n in enumerate(self.size)]
         x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
         below = normal[0] * x + normal[1] * y + normal[2] * z < offset
-        self._empty[below], self._near[below] = MIN_EMPTY, 0.0
+        self._empty[below], self._near[below] = np.inf, 0.0
 
     def surface(self) -> ClosedSurface:
         """Closed surface of the largest part; without faces if all voxels are empty."""
         near = (self._near > 0) & (self._empty <= EMPTY_RATIO * self._near)
-        empty = (self._empty >= min(MIN_EMPTY, self.sets)) & ~near
+        least = min(MIN_EMPTY, self.sets) * np.mean(self._certainties)
+        empty = (self._empty >= least) & ~near
         value = np.where(near, self._distance / np.maximum(self._total, 1e-9), -BAND_M)
         value[empty] = BAND_M
         for axis in range(3):  # outside the grid is empty
@@ -123,7 +138,9 @@ class Volume:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _integrate(distance, total, near, empty, low, voxel, depth, kind, weight, pinhole, pose):
+def _integrate(
+    distance, total, near, empty, low, voxel, depth, kind, weight, pinhole, pose, variance
+):
     """Kernel of :meth:`Volume.integrate`."""
     height, width = depth.shape
     fx, fy, cx, cy = pinhole
@@ -143,10 +160,18 @@ def _integrate(distance, total, near, empty, low, voxel, depth, kind, weight, pi
                 if kind[row, column] == UNKNOWN:
                     continue
                 away = depth[row, column] - pz
+                if away < -BAND_M:
+                    continue
+                spread = variance[3, 3]
+                for a, value in enumerate((x, y, z)):
+                    spread += 2.0 * variance[a, 3] * value
+                    for b, other in enumerate((x, y, z)):
+                        spread += variance[a, b] * value * other
+                certainty = BAND_M**2 / (BAND_M**2 + spread)
                 if away > BAND_M:
-                    empty[i, j, k] += 1.0
-                elif kind[row, column] == OBJECT and away > -BAND_M:
+                    empty[i, j, k] += certainty
+                elif kind[row, column] == OBJECT:
                     w = weight[row, column] * np.exp(-0.5 * (away / NOISE_M) ** 2)
                     distance[i, j, k] += w * away
                     total[i, j, k] += w
-                    near[i, j, k] += 1.0
+                    near[i, j, k] += certainty

@@ -7,8 +7,9 @@ import pytest
 import trimesh
 
 from intercap_core.errors import UserError
+from intercap_core.geometry.camera.transforms import apply, rigid, rotation_exp
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.scan.fusion import Posed, fuse, vertex_colours
+from intercap_core.scan.fusion import Posed, fuse, place_variance, vertex_colours
 from tests.scan.turned_object import Turned, turning
 
 BOX = trimesh.creation.box((0.12, 0.16, 0.20))
@@ -35,6 +36,36 @@ def test_a_turned_box_is_closed_and_of_its_size(noise_m: float) -> None:
     assert np.quantile(abs(off), 0.9) < 2.0  # a voxel; edges are rounded
     assert abs(np.median(off)) < 0.7
     assert surface.measured.mean() > 0.99
+
+
+def test_uncertain_poses_count_less() -> None:
+    """Two of three poses are turned by 12 degrees and have a standard deviation of 12 degrees."""
+    part = posed(BOX, turning(24, 15.0))
+    turn = np.radians(12.0)
+    poses, covariances = dict(part.poses), {t: 1e-6 * np.eye(6) for t in part.poses}
+    for t in (t for t in poses if t % 3):
+        pose = poses[t].copy()
+        pose[:3, :3] = rotation_exp(turn * np.eye(3)[t // 3 % 3] * (-1) ** t) @ pose[:3, :3]
+        poses[t], covariances[t] = pose, np.diag([turn**2] * 3 + [1e-6] * 3)
+    off = {}
+    for name, known in (("equal", {}), ("weighted", covariances)):
+        surface = fuse([Posed(part.recording, part.surfaces, poses, known)])
+        off[name] = float(np.quantile(abs(distances_mm(BOX, surface.vertices)), 0.95))
+    assert off["weighted"] < 2.5 and off["weighted"] < 0.6 * off["equal"]
+
+
+def test_place_variance_is_that_of_drawn_poses() -> None:
+    random = np.random.default_rng(5)
+    root = random.standard_normal((6, 6)) * np.array([0.02] * 3 + [0.003] * 3)[:, None]
+    covariance = root @ root.T
+    pose = rigid(rotation_exp(random.standard_normal(3)), random.standard_normal(3))
+    point = np.array([0.1, -0.2, 0.05])
+    drawn = random.multivariate_normal(np.zeros(6), covariance, 100_000)
+    arm = pose[:3, :3] @ point
+    moved = np.cross(drawn[:, :3], arm) + drawn[:, 3:]
+    assert apply(pose, point[None])[0] == pytest.approx(arm + pose[:3, 3])
+    form, place = place_variance(pose, covariance), np.append(point, 1.0)
+    assert place @ form @ place == pytest.approx(moved.var(0).mean(), rel=0.02)
 
 
 def test_a_thin_wall_keeps_its_two_sides() -> None:
