@@ -104,8 +104,9 @@ def fuse(
     if not len(surface.faces):
         sequences = ", ".join(part.recording.frames.sequence for part in parts)
         raise UserError(
-            f"sequence {sequences}: the depth images leave no surface of the object, in {volume.sets} "
-            "frame sets with a pose of it; turn it more slowly, and nearer to the cameras"
+            f"sequence {sequences}: the depth images leave no surface of the object, in "
+            f"{volume.sets} frame sets with a pose of it; turn it more slowly, and nearer to the "
+            "cameras"
         )
     return surface
 
@@ -113,8 +114,8 @@ def fuse(
 def place_variance(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Quadratic form Q (4, 4) of the variance of the object's points under an uncertain pose.
 
-    (x, 1) Q (x, 1)' is the variance of the point x of the object's frame in the master frame, square
-    metres, averaged over the three directions.
+    (x, 1) Q (x, 1)' is the variance of the point x, averaged over the three directions, square
+    metres.
 
     Args:
         pose: (4, 4) master_from_object.
