@@ -24,11 +24,13 @@ from intercap_core.formats.recordings.extract import ExtractedCamera, extract
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.sound_delays import sound_starts
 from intercap_core.formats.recordings.synchronise import (
+    LONG_STEP_US,
     OUTLIER,
     SetTable,
     choose_epoch,
     clock_drift_us,
     distance_to,
+    find_clock_jumps,
     nearest_images,
     split_into_epochs,
     synchronise,
@@ -175,9 +177,10 @@ def _require_usable(views: list[ExtractedCamera], sequence: SequenceEntry) -> No
 
 
 def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
-    """If a device's clock was reset, keep only the epoch that overlaps the other cameras in
-    time."""
+    """Undo jumps ahead of single clocks; if a clock was reset, keep only the epoch that overlaps
+    the other cameras in time."""
     present = [view for view in views if view.present]
+    _undo_jumps_ahead(present)
     epochs = {view.name: split_into_epochs(view.usable_times) for view in present}
     straight = [view for view in present if epochs[view.name].max() == 0]
     if not straight:
@@ -188,6 +191,22 @@ def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
     reference = np.concatenate([view.usable_times for view in straight])
     for view in present:
         _keep_one_epoch(view, epochs[view.name], reference)
+
+
+def _undo_jumps_ahead(views: list[ExtractedCamera]) -> None:
+    """Move the images after a jump ahead of one camera's clock back by the jump, with a note."""
+    times = [view.usable_times for view in views]
+    for camera, view in enumerate(views):
+        others = times[:camera] + times[camera + 1 :]
+        for jump in find_clock_jumps(times[camera], others, 1e6 / view.fps):
+            image = int(np.flatnonzero(view.colour_usable)[jump.image])
+            view.notes.append(
+                f"its device times jump ahead by {jump.ahead_us / 1e6:.1f} s before image {image}, "
+                "those of the other cameras do not: later images were moved back by this; set no "
+                "clock (NTP, PTP) during a recording"
+            )
+            view.colour_times = jump.undo(view.colour_times)
+            view.depth_times = jump.undo(view.depth_times)
 
 
 def _keep_one_epoch(view: ExtractedCamera, epoch: np.ndarray, reference_us: np.ndarray) -> None:
@@ -295,10 +314,18 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
     gaps = table.gaps(period_us)
     if gaps:
         lost = sum(length for _, length in gaps)
-        views[clock].notes.append(
+        note = (
             f"no camera has an image for {lost} periods in {len(gaps)} places, the first after "
             f"frame set {gaps[0][0]}"
         )
+        longest, length = max(gaps, key=lambda gap: gap[1])
+        if length * period_us > LONG_STEP_US:
+            note += (
+                f"; after frame set {longest} for {length * period_us / 1e6:.1f} s: unless the "
+                "recording was paused, the cameras' common clock was set ahead; set no clock (NTP, "
+                "PTP) during a recording"
+            )
+        views[clock].notes.append(note)
     for camera, view in enumerate(views):
         if not view.present:
             continue

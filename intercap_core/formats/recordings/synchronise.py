@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -210,6 +211,74 @@ def choose_epoch(
         return int(np.argmax(np.bincount(epoch[epoch >= 0])))
     counts = np.bincount(epoch[near])
     return int(np.argmax(counts >= counts.max() * 0.5))
+
+
+# A longer step from one image to the next is a pause of the recording or a jump of the clock,
+# microseconds. Cameras that people stop by hand end within a few seconds of each other.
+LONG_STEP_US = 10_000_000
+
+
+class ClockJump(NamedTuple):
+    """A place where a device's clock was set ahead."""
+
+    image: int
+    """The first image with the new time."""
+    before_us: int
+    """Device time of the image before."""
+    ahead_us: int
+    """Time by which the clock was set ahead."""
+
+    def undo(self, times_us: np.ndarray) -> np.ndarray:
+        """Times (N,) of images of the device, in which those after the jump continue the others."""
+        later = times_us > self.before_us + self.ahead_us // 2
+        return times_us - np.where(later, self.ahead_us, 0)
+
+
+def find_clock_jumps(
+    times_us: np.ndarray, others_us: Sequence[np.ndarray], period_us: float
+) -> list[ClockJump]:
+    """Jumps ahead of a camera's clock that other cameras' clocks do not make, the latest first.
+
+    A long step is a pause if the images after it agree with the other cameras, and a jump if the
+    camera ends later than the others by its length. A step that a camera shares is no evidence
+    against that camera, so that a pause of the whole recording is no jump.
+
+    Args:
+        times_us: (N,) int64 device times in the order of recording.
+        others_us: (N_c,) the same of each other camera.
+        period_us: usual time between two images.
+    """
+    jumps = _long_steps(times_us, period_us)
+    reference = [
+        times
+        for times in others_us
+        if not any(
+            abs(own.ahead_us - other.ahead_us) < 2 * period_us
+            for own in jumps
+            for other in _long_steps(times, period_us)
+        )
+    ]
+    if not jumps or not reference:
+        return []
+    late_us = times_us.max() - max(times.max() for times in reference)
+    explained: list[ClockJump] = []
+    tolerance = 0.25  # of the jump, by which the ends of the cameras may differ
+    for jump in sorted(jumps, key=lambda jump: -jump.ahead_us):
+        if late_us > (1 - tolerance) * jump.ahead_us:
+            explained.append(jump)
+            late_us -= jump.ahead_us
+    if late_us > tolerance * sum(jump.ahead_us for jump in explained):
+        return []
+    return sorted(explained, reverse=True)
+
+
+def _long_steps(times_us: np.ndarray, period_us: float) -> list[ClockJump]:
+    """Each step to the next image that is longer than ``LONG_STEP_US``, as a jump."""
+    steps = np.diff(times_us)
+    return [
+        ClockJump(int(at) + 1, int(times_us[at]), int(steps[at] - period_us))
+        for at in np.flatnonzero(steps > LONG_STEP_US)
+    ]
 
 
 def clock_drift_us(times_us: np.ndarray, skew_us: np.ndarray) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from intercap_core.formats.recordings.synchronise import (
     OUTLIER,
     choose_epoch,
     clock_drift_us,
+    find_clock_jumps,
     split_into_epochs,
 )
 from intercap_core.schemas import FRAMES
@@ -82,6 +84,8 @@ def stays(missing=(), depth=True, count=TICKS):
         (with_clock(1, 4, 500_000), 1, "jump back 1 times: 8 images", stays(range(4, 12))),
         (with_clock(1, 7, 3_150_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
         (with_clock(0, 7, 500_000), 0, "jump back 1 times: 5 images", stays(range(7, 12))),
+        (with_clock(1, 7, 303_466_662), 1, "ahead by 300.0 s before image 7", stays()),
+        (with_clock(0, 7, 303_466_662), 0, "ahead by 300.0 s before image 7", stays()),
         (one_wrong_time, 1, "1 images with device times out of order", stays(missing=[5])),
     ],
 )  # fmt: skip
@@ -110,6 +114,18 @@ def test_a_faulty_camera_does_not_affect_the_others(capture, fault, camera, word
         else:
             assert frames.rig[camera].depth is None
             assert not frames.depth_available[:, camera].any()
+
+
+def test_a_pause_of_all_cameras_or_a_jump_of_their_common_clock_is_noted(capture):
+    for camera in range(3):
+        with_clock(camera, 7, 303_466_662)(capture.recordings)
+    output = run(capture)
+    words = (
+        r"after frame set 6 for 300\.0 s: unless the recording was paused, .*clock was set ahead"
+    )
+    assert re.search(words, notes_of(output)["k1"])
+    with Frames.open(output) as frames:
+        assert frames.num_sets == TICKS and frames.available.all()
 
 
 def test_if_all_clocks_reset_the_longer_epoch_is_kept(capture):
@@ -241,6 +257,45 @@ def test_the_epoch_that_overlaps_the_others_is_chosen():
     assert choose_epoch(times, split_into_epochs(times), np.arange(20), 0.5) == 0
     times = np.array([7, 5, 6, 7, 8, 9])  # an image left from before the common start
     assert choose_epoch(times, split_into_epochs(times), np.arange(20), 0.5) == 1
+
+
+SECOND = 1_000_000
+
+
+def seconds(*spans: tuple[float, float]) -> np.ndarray:
+    """Times of ten images a second in each of the spans."""
+    spans = [np.arange(start * 10, end * 10) / 10 for start, end in spans]
+    return np.round(np.concatenate(spans) * SECOND).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "jumps"),
+    [
+        # one clock is set ahead, before or after the end of the others
+        ([(0, 60), (90, 130)], [[(0, 100)]], [(600, 30)]),
+        ([(0, 60), (960, 1000)], [[(0, 100)], [(3, 101)]], [(600, 900)]),
+        # twice; and once by the clock of several cameras
+        ([(0, 60), (260, 280), (400, 420)], [[(0, 100)]], [(800, 120), (600, 200)]),
+        ([(0, 60), (90, 130)], [[(0, 100)], [(0, 60.1), (90.1, 131)]], [(600, 30)]),
+        # pauses: of one camera, of all, and of one camera that ends later than the others
+        ([(0, 60), (90, 100)], [[(0, 100)]], []),
+        ([(0, 60), (90, 130)], [[(0, 60), (90, 130)]], []),
+        ([(0, 60), (72, 300)], [[(0, 100)]], []),
+        ([(0, 60), (72, 100)], [[(0, 30), (230, 300)]], []),
+        # a pause and a jump of one camera
+        ([(0, 20), (32, 60), (360, 400)], [[(0, 100)]], [(480, 300)]),
+        ([(0, 60), (90, 130)], [], []),
+    ],
+)
+def test_a_jump_ahead_is_told_from_a_pause(own, others, jumps):
+    times, others = seconds(*own), [seconds(*spans) for spans in others]
+    found = find_clock_jumps(times, others, SECOND / 10)
+    assert [(jump.image, round(jump.ahead_us / SECOND)) for jump in found] == jumps
+    for jump in found:
+        times = jump.undo(times)
+    if jumps:
+        assert abs(times[-1] - max(other[-1] for other in others[:1])) < 3 * SECOND
+        assert np.diff(times).max() < 13 * SECOND
 
 
 def test_drift_ignores_jitter_and_gaps():
