@@ -383,7 +383,11 @@ def check_row(project: Project, row: SequenceEntry) -> RecordingCheck:
     ]
     used = [name for name in layout.names if not settings.cameras or name in settings.cameras]
     faults += [
-        f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add the camera"
+        layout.pose_faults.get(
+            name,
+            f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add the "
+            "camera",
+        )
         for name in used
         if name not in known
     ]

@@ -211,6 +211,7 @@ def write_camera(
     *,
     world: np.ndarray | None = None,
     depth: bool = True,
+    encoding: str = "bgr8",
 ) -> None:
     """Add one camera with raw colour, raw depth, lenses and transforms, as drivers publish them."""
     place = np.eye(4) if world is None else world
@@ -221,6 +222,6 @@ def write_camera(
         bag.lens(f"/{name}/depth/camera_info", DEPTH_SIZE, DEPTH_K, f"{name}_depth")
     for t in range(images):
         at = START_NS + t * PERIOD_NS
-        bag.image(f"/{name}/color/image_raw", at, f"{name}_color", colour_image(t), "bgr8")
+        bag.image(f"/{name}/color/image_raw", at, f"{name}_color", colour_image(t), encoding)
         if depth:
             bag.image(f"/{name}/depth/image_raw", at, f"{name}_depth", depth_image(t), "16UC1")

@@ -95,8 +95,8 @@ def extract(
     """
     view = ExtractedCamera(name)
     if name not in layout.extrinsics.master_from_colour:
-        calibration = layout.sequence.calibration.name
-        view.notes.append(f"no pose in {calibration}; add the camera there")
+        absent = f"no pose in {layout.sequence.calibration.name}; add the camera there"
+        view.notes.append(_without_folders(layout.pose_faults.get(name, absent), layout))
         return view
     if name not in layout.names:
         view.notes.append(f"no recording of {name} in {layout.sequence.recordings.name}")
@@ -115,16 +115,16 @@ def extract(
     except UserError as error:
         view.notes.append(str(error))
         view.camera = None
-    view.notes = [printable(_without_folders(note, layout)) for note in view.notes]
+    view.notes = [_without_folders(note, layout) for note in view.notes]
     return view
 
 
 def _without_folders(text: str, layout: RecordingLayout) -> str:
-    """Make paths relative to the sequence's folders, because artefacts hold no absolute paths."""
+    """Printable text with paths relative to the sequence's folders: artefacts hold no others."""
     recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
     for folder in (recordings, calibration.parent):
         text = text.replace(f"{folder}/", "")
-    return text.replace(str(recordings), recordings.name)
+    return printable(text.replace(str(recordings), recordings.name))
 
 
 class _Copy:

@@ -164,9 +164,12 @@ class RecordingLayout(ABC):
     """Poses of the cameras. Their order is that of every axis C of the sequence's arrays."""
     names: list[str]
     """Cameras with a recording, including those without a pose."""
+    pose_faults: dict[str, str]
+    """Why a recording does not give its camera's pose, by the camera's name."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
         self.sequence = sequence
+        self.pose_faults = {}
 
     @abstractmethod
     def open(self, name: str) -> CameraRecording:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -30,6 +30,7 @@ from intercap_core.formats.recordings.ros.bag import Bag, find_bags, is_bag, nam
 from intercap_core.formats.recordings.ros.images import decode_colour, decode_depth
 from intercap_core.formats.recordings.ros.lenses import STATIC_TRANSFORMS, StaticTransforms
 from intercap_core.formats.recordings.ros.streams import (
+    IMAGE_TYPES,
     CameraStreams,
     Scheme,
     Stream,
@@ -44,7 +45,7 @@ from intercap_core.formats.recordings.source import (
 )
 from intercap_core.formats.recordings.timestamps import frame_rate
 from intercap_core.geometry.camera.rig import Camera, stereo_depth_noise
-from intercap_core.inputs.files import name_some
+from intercap_core.inputs.files import name_some, quoted
 
 SCHEMES: tuple[Scheme, ...] = (realsense.SCHEME, orbbec.SCHEME, standard.SCHEME)
 RATE_IMAGES = 16  # first images, whose times give the rate
@@ -69,17 +70,20 @@ def find_cameras(recordings: Path) -> list[str]:
     return sorted(_find_places(recordings)) if find_bags(recordings) else []
 
 
-def _find_places(recordings: Path) -> dict[str, _Place]:
-    """Cameras by name: in a single bag that of their topics, else that of the file."""
+def _find_places(recordings: Path, preferred: Sequence[str] = ()) -> dict[str, _Place]:
+    """Cameras by name: in a single bag that of their topics, else that of the file.
+
+    Raises UserError if no bag has one of the ``preferred`` topics, unless a bag cannot be read.
+    """
     bags = find_bags(recordings)
     places: dict[str, _Place] = {}
-    topics: list[str] = []
+    topics: dict[str, str] = {}  # types by name
     for path in bags:
         fault = ""
         try:
             with Bag(path) as bag:
                 names = _scheme_of(bag).list_cameras(bag)
-                topics += list(bag.topics)
+                topics |= {topic: info.msgtype for topic, info in bag.topics.items()}
         except MissingPackage:
             raise
         except UserError as error:
@@ -96,7 +100,14 @@ def _find_places(recordings: Path) -> dict[str, _Place]:
     if bags and not places:
         raise UserError(
             f"{recordings}: no bag has a topic of type sensor_msgs/Image or CompressedImage; it "
-            f"has {name_some(sorted(set(topics)), 8) or 'no messages'}"
+            f"has {name_some(sorted(topics), 8) or 'no messages'}"
+        )
+    images = sorted(topic for topic, kind in topics.items() if kind in IMAGE_TYPES)
+    unknown = sorted(set(preferred).difference(images))
+    if unknown and not any(place.fault for place in places.values()):
+        raise UserError(
+            f"{recordings}: column topics names {', '.join(map(quoted, unknown))}, the topics with "
+            f"images are {', '.join(images)}; correct the column"
         )
     return places
 
@@ -115,7 +126,8 @@ class RosLayout(RecordingLayout):
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
-        self._places = _find_places(sequence.recordings)
+        self._preferred = (sequence.topics or "").split()
+        self._places = _find_places(sequence.recordings, self._preferred)
         self.names = sorted(self._places)
         self._known: dict[str, CalibratedCamera] = {}
         path, scale = sequence.calibration, sequence.calibration_scale
@@ -128,19 +140,24 @@ class RosLayout(RecordingLayout):
         self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
 
     def _static_poses(self, path: Path) -> Extrinsics:
-        """Poses of all cameras; raises UserError if one of them cannot be read."""
-        fault = next((place.fault for place in self._places.values() if place.fault), "")
-        if fault:
-            raise UserError(fault)
-        paths = {place.path for place in self._places.values()} | (
-            {path} if is_bag(path) else set()
-        )
+        """Poses of the cameras that can be read; raises UserError if there are none.
+
+        The faults of the others are added to ``pose_faults``.
+        """
+        places = dict(sorted(self._places.items()))
+        self.pose_faults = {name: place.fault for name, place in places.items() if place.fault}
+        readable = {name: place for name, place in places.items() if not place.fault}
+        paths = {place.path for place in readable.values()} | ({path} if is_bag(path) else set())
+        frames = {}
         with contextlib.ExitStack() as opened:
             bags = {path: opened.enter_context(Bag(path)) for path in sorted(paths)}
-            frames = {
-                name: self._streams(bags[place.path], name).frame
-                for name, place in sorted(self._places.items())
-            }
+            for name, place in readable.items():
+                try:
+                    frames[name] = self._streams(bags[place.path], name).frame
+                except UserError as error:
+                    self.pose_faults[name] = str(error)
+            if not frames:
+                raise UserError(next(iter(self.pose_faults.values())))
             transforms = StaticTransforms(bags.values())
         if transforms.is_empty or not all(frames.values()):
             raise UserError(
@@ -150,8 +167,8 @@ class RosLayout(RecordingLayout):
         return transforms.extrinsics(path, frames)
 
     def _streams(self, bag: Bag, name: str) -> CameraStreams:
-        preferred = (self.sequence.topics or "").split()
-        return _scheme_of(bag).read(bag, self._places[name].name, preferred, self._known.get(name))
+        known = self._known.get(name)
+        return _scheme_of(bag).read(bag, self._places[name].name, self._preferred, known)
 
     def open(self, name: str) -> CameraRecording:
         """Open the camera's streams.

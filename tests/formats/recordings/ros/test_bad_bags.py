@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from intercap_core.config import FramesSettings
+from intercap_core.commands.check_recordings import check_row
+from intercap_core.config import DetectionsSettings, FramesSettings
 from intercap_core.errors import UserError
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.layouts import (
     input_files,
     open_layout,
@@ -109,6 +112,47 @@ def test_a_faulty_camera_is_named(tmp_path: Path, fault: str) -> None:
     assert layout.names == ["k1"]
     with pytest.raises(UserError, match=message):
         layout.open("k1")
+
+
+@pytest.mark.parametrize("calibration", ["static transforms", "rig file"])
+def test_a_camera_that_cannot_be_read_is_left_out_with_the_reason(
+    tmp_path: Path, calibration: str
+) -> None:
+    recordings, output = tmp_path / "recordings", tmp_path / "frames.h5"
+    recordings.mkdir()
+    for name, encoding in (("k1", "bayer_rggb8"), ("k2", "bgr8"), ("k3", "bgr8")):
+        with BagFile(recordings / f"{name}.bag", "bag") as bag:
+            write_camera(bag, name, world=pose(0.1, float(name[1]), 0, 0), depth=False,
+                         encoding=encoding)  # fmt: skip
+    (recordings / "k3.bag").write_bytes(b"no bag at all" * 10)
+    rig = rig_file(tmp_path, "k1", "k2", "k3") if calibration == "rig file" else None
+    entry = row(recordings, calibration=rig)
+    frames.run(sequence=entry, output=output, settings=FramesSettings())
+    notes = notes_of(output)
+    assert "k1.bag: topic /k1/color/image_raw has images of encoding 'bayer_rggb8'" in notes["k1"]
+    assert "record another topic of the camera, or convert the bag" in notes["k1"]
+    assert "k3.bag: cannot be read as a ROS bag" in notes["k3"]
+    assert str(tmp_path) not in "".join(notes.values())
+    with Frames.open(output) as result:
+        seen = dict(zip(result.rig.names, result.colour_available.sum(axis=0), strict=True))
+    assert seen == {"k1": 0, "k2": 4, "k3": 0}
+    settings = SimpleNamespace(detections=DetectionsSettings(), frames=FramesSettings())
+    faults = check_row(SimpleNamespace(config=settings, object_of=lambda _: None), entry).faults
+    assert [name for name in ("k1", "k2", "k3") if f"{name}.bag" in " ".join(faults)] == [
+        "k1",
+        "k3",
+    ]
+
+
+@pytest.mark.parametrize(
+    "topic", ["/k1/depth/image_rect_raw ", "/k1/color/camera_info", "k1/color/image_raw"]
+)
+def test_an_unknown_topic_in_the_column_is_named(tmp_path: Path, topic: str) -> None:
+    with BagFile(tmp_path / "walk", "mcap") as bag:
+        write_camera(bag)
+    known = "/k1/color/image_raw, /k1/depth/image_raw"
+    with pytest.raises(UserError, match=f"column topics names '{topic.strip()}', .* are {known};"):
+        open_layout(row(tmp_path, f"/k1/color/image_raw {topic}"))
 
 
 def test_cameras_without_common_frame_are_named(tmp_path: Path) -> None:
