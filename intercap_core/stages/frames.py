@@ -150,17 +150,18 @@ def _note_same_devices(views: list[ExtractedCamera]) -> None:
             continue
         if not (first.present and second.present):
             continue
-        files = f"{first.source.name} and {second.source.name}"
+        files = (first.source.name, second.source.name)
+        cameras = f"cameras {first.name} ({files[0]}) and {second.name} ({files[1]})"
         note = ""
         if first.fingerprint == second.fingerprint and np.array_equal(
             first.colour_times, second.colour_times
         ):
-            note = f"{files} hold the same images: {second.source.name} is set aside"
+            note = f"{cameras} hold the same images: {second.name} is left out"
             second.camera = None
         elif first.serial:
             note = (
-                f"{files} have the same serial number {first.serial}: check which camera each was "
-                "recorded with"
+                f"{cameras} have the same serial number {first.serial}: check which camera "
+                "each was recorded with"
             )
         for view in (first, second):
             view.notes += [note] * bool(note)

@@ -78,8 +78,8 @@ def stays(missing=(), depth=True, count=TICKS):
 @pytest.mark.parametrize(
     ("fault", "camera", "words", "kept"),
     [
-        (same_serial, 2, "k2.mkv and k3.mkv have the same serial number 1", stays()),
-        (copied, 2, "k2.mkv and k3.mkv hold the same images", stays(missing=range(TICKS))),
+        (same_serial, 2, "k2 (k2.mkv) and k3 (k3.mkv) have the same serial number 1", stays()),
+        (copied, 2, "k2 (k2.mkv) and k3 (k3.mkv) hold the same", stays(missing=range(TICKS))),
         (zero_depth, 1, "depth is zero in all 12 images", stays(depth=False)),
         (with_clock(1, 4, 500_000), 1, "jump back 1 times: 8 images", stays(range(4, 12))),
         (with_clock(1, 7, 3_150_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),

@@ -279,3 +279,15 @@ def test_a_clock_that_jumps_back_is_noted(tmp_path: Path) -> None:
     path = tmp_path / "frames.h5"
     frames.run(sequence=row(tmp_path), output=path, settings=FramesSettings())
     assert "jump back 1 times: 6 images" in notes_of(path)["k2"]
+
+
+def test_cameras_with_the_same_images_in_one_bag_are_named(tmp_path: Path) -> None:
+    with BagFile(tmp_path / "walk", "mcap") as bag:
+        write_camera(bag, "k1")
+        write_camera(bag, "k2", world=pose(0.1, 1.0, 0, 0))
+    path = tmp_path / "frames.h5"
+    frames.run(sequence=row(tmp_path), output=path, settings=FramesSettings())
+    assert (
+        "cameras k1 (walk) and k2 (walk) hold the same images: k2 is left out"
+        in notes_of(path)["k1"]
+    )
