@@ -41,7 +41,7 @@ def physics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     depth = depth[np.isfinite(depth)]
     return finite(
         {
-            "releases": float(len(moved)),
+            "releases": len(moved),
             **shares,
             "bad_share": float(bad.mean()),
             "displacement_mm": 1e3 * over_known(np.mean, moved),

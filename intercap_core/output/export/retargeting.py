@@ -86,14 +86,17 @@ class Resampled:
 
     def to_arrays(self, content: Content) -> dict[str, np.ndarray]:
         """Serialize what both formats state besides the motion."""
-        flags = content.about.flags
+        flags, physics = content.about.flags, content.about.physics
+        nearest = np.rint(self.source_frame).astype(int)
         arrays: dict[str, Any] = {
             **Coordinates.of(self.motion).to_arrays(),
             **content.about.body.to_arrays(),
             "source_frame": self.source_frame,
             "flag_part": np.array(PARTS),
-            "flagged": flags.flagged[np.rint(self.source_frame).astype(int)],
+            "flagged": flags.flagged[nearest],
         }
+        if physics is not None:
+            arrays |= {name: values[nearest] for name, values in physics.per_frame.items()}
         if self.object_poses is not None:
             arrays |= {
                 "object": np.array(self.motion.object_),
@@ -172,10 +175,13 @@ gmr/*.npz           as GMR (smplx_to_robot.py) reads it: gender, betas (S,), roo
 {% endif %}
   z up, metres; resampled to 30 frames per second, which GMR assumes; source_frame (N,) is the
     frame of the recording, flagged (N,P) those of flag_part that are not reliable
+{% if about.physics and about.physics.per_frame %}
+  carrier, physics_bad (N,): as below
+{% endif %}
 """
 _HOLOSOMA_README = """
 holosoma/*.npz      as holosoma's format smplx reads it: global_joint_positions (N,22,3), height
-  z up, metres; resampled to 30 frames per second; source_frame, flagged as in gmr
+  z up, metres; resampled to 30 frames per second; source_frame and facts about each frame as in gmr
 {% if mesh %}
   object_poses (N,7): qw qx qy qz x y z, frame from object, metres
 holosoma/*.pt       as its task object_interaction reads it: tensor (N,591) in InterMimic's layout,

@@ -168,7 +168,7 @@ def quality_tiles(sequences: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     released = physics_figures(sequences)
     if "displacement_mm" in released:
         note = (
-            f"mean over {released['releases']:.0f} releases at rest, {RELEASED_FRAMES} simulated "
+            f"mean over {released['releases']} releases at rest, {RELEASED_FRAMES} simulated "
             f"frames; unsupported in {100 * released['unsupported_share']:.0f} % of the frames"
         )
         tiles.append(tile("object moves when released", released["displacement_mm"], "mm", note))

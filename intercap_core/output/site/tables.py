@@ -252,6 +252,11 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
                 columns[f"contact_probability.{region}"] = s.values["contact_probability"][:, r]
         for name in sorted((_MILLIMETRES | _ACCELERATIONS) & s.values.keys()):
             columns[f"{name}_mm"] = 1e3 * s.values[name].astype(np.float64)
+        if "physics/carrier" in s.values:
+            columns["physics.carrier"] = [str(name) for name in s.values["physics/carrier"]]
+            columns["physics.bad"] = s.values["physics/bad"]
+            depth = s.values["physics/penetration"].astype(np.float64)
+            columns["physics.penetration_mm"] = 1e3 * depth
         for place, part in enumerate(s.values.get("verdict/part_names", ())):
             columns[f"verdict.{part}_mm"] = 1e3 * s.values["verdict/error_frame"][place]
         for stage in ESTIMATES:
