@@ -15,7 +15,12 @@ from tests.helpers.flow import share_kernels
 from tests.helpers.shared_folder import session_folder
 
 ROOT = Path(__file__).resolve().parents[2]
-CHAPTERS = {"A new keypoint layout": 1, "A new converter": 1, "A new export format": 2}
+CHAPTERS = {
+    "A new keypoint layout": 1,
+    "A new converter": 1,
+    "A new recorder of bags": 2,
+    "A new export format": 2,
+}
 """Number of the files, besides the test, that each chapter writes or edits."""
 FIXTURES = ("tests.output.conftest", "tests.output.export.conftest")
 
@@ -43,7 +48,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
 
 
 @pytest.mark.parametrize(("title", "count"), CHAPTERS.items())
-def test_a_chapter_takes_one_file_and_its_name_in_the_settings(
+def test_a_chapter_takes_one_file_and_its_name_in_a_list(
     title: str, count: int, files: dict[str, list[Path]]
 ) -> None:
     assert len(files[title]) == count

@@ -2,7 +2,8 @@
 
 A correct pose on its support stays where it is. The displacement of the centre of mass over
 :data:`RELEASED_FRAMES` frames is therefore a measure of the pose's error that needs no truth.
-The protocol is that of HUMOTO (Lu et al., ICCV 2025) with MuJoCo instead of PyBullet.
+The idea and the number of frames are those of HUMOTO (Lu et al., ICCV 2025), which releases all
+objects of a scene in PyBullet, also those that a person holds; its figures are not comparable.
 
 The support is a horizontal plane: the floor or a level piece of furniture (:mod:`.supports`). A
 rigid body touches a plane only with its convex hull. The hull of the mesh as collision shape is
