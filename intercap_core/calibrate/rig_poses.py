@@ -10,23 +10,26 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_INDEX, NUM_KEYPOINTS
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.calibrate.adjust import BoardTerm, JointTerm, adjust, jackknife_covariance
 from intercap_core.calibrate.background import confirm_by_joints, place_by_background
+from intercap_core.calibrate.checks import (
+    check_agreement,
+    check_gravity,
+    check_walk,
+    describe_unplaced,
+    require_evidence,
+    require_images,
+)
 from intercap_core.calibrate.evidence import (
     CORNERS,
     JOINTS,
-    MIN_SEEN,
     NUM_JOINTS,
     Nobody,
     Views,
     find_views,
 )
-from intercap_core.calibrate.found_rig import (
-    FoundRig,
-    compare_pairs,
-    count_shared_joints,
-)
+from intercap_core.calibrate.found_rig import FoundRig, count_shared_joints, measure_residuals
 from intercap_core.calibrate.lenses import LensEstimate, describe_coverage, estimate_lens
 from intercap_core.calibrate.placement import (
     Placement,
@@ -49,15 +52,6 @@ from intercap_core.scene.start_times import MAX_DELAY_S
 
 log = logging.getLogger(__name__)
 
-HIPS = [KEYPOINT_INDEX["left_hip"], KEYPOINT_INDEX["right_hip"]]
-MIN_WALK_M = 0.4  # extent of the person's way; less moves every joint within its detector's errors
-# Pose2Sim's demonstration lasts 1.6 s; its cameras, 3 to 7 m apart, are found to 62 mm (real_rigs).
-MIN_WALK_S = 1.5
-SURE_WALK_S = 3.0  # in less, errors of a detector hardly change, so estimated errors lack them
-# Largest median error of a camera's joints or corners over that of all cameras; those of the
-# studio's rigs are below 2, with left and right exchanged above 10
-MAX_ERROR_RATIO = 4.0
-MAX_GRAVITY_DEG = 5.0  # between gravity sensors; one of a Kinect is within a degree
 # Relative error of the scale that depth cameras share: the systematic error of an Azure Kinect is
 # at most 11 mm + 0.1 % of the depth (data sheet), taken as two standard deviations; mean of six
 # cameras at 2.5 m.
@@ -97,18 +91,18 @@ def find_poses(
             for frames, (_, path) in zip(opened, recordings, strict=True)
         ]
         rig = opened[0].rig
-        _require_images(opened)
+        require_images(opened)
         log.info("looking for people%s", " and the board" if board else "")
         views = Views.joined(
             [find_views(f, p, rig, board) for f, p in zip(opened, people, strict=True)]
         )
-        _require_evidence(rig, views, board)
+        require_evidence(rig, views, board)
         notes: list[str] = []
         rig, new_lenses = _lenses(rig, views, board, without_lens, keep_lenses, notes)
         if board is not None:
             check_board_size(rig, views, board)
         max_lag = max(1, round(MAX_DELAY_S * opened[0].fps))
-        found, views, of_board = _place(rig, views, board, max_lag, opened[0], background)
+        found, views = _place(rig, views, board, max_lag, opened[0], background)
         found.notes += notes
         found.new_lenses = new_lenses
         _add_lens_errors(found)
@@ -116,52 +110,19 @@ def find_poses(
         found.scale = "depth" if metric else ""
         if metric and board is not None and found.boards.any():
             found.scale = "board" if not _has_depth(views) else "board and depth"
-        _check_agreement(found)
-        _refine(found, opened[0], people[0], of_board)
+        check_agreement(found)
+        _refine(found, opened[0], people[0], _terms(found.rig, views, board)[1])
         if distance is not None or not metric:
             rescale(found, views, distance, height_m)
-        _check_walk(found, views)
-        _check_gravity(found.rig, opened[0].gravity)
+        found.residuals = measure_residuals(found.rig, views, *_terms(found.rig, views, board))
+        check_agreement(found)
+        check_walk(found, views)
+        check_gravity(found.rig, opened[0].gravity)
         return found
 
 
 def _has_depth(views: Views) -> bool:
     return bool(np.isfinite(views.distance[:, :, JOINTS]).any())
-
-
-def _require_images(opened: Sequence[Frames]) -> None:
-    names = opened[0].rig.names
-    for frames in opened:
-        if frames.rig.names != names:
-            raise UserError(
-                f"recording {frames.sequence!r} has cameras {', '.join(frames.rig.names)}, the "
-                f"first has {', '.join(names)}; record all with the same rig and names"
-            )
-    absent = [n for c, n in enumerate(names) if not any(f.available[:, c].any() for f in opened)]
-    if absent:
-        raise UserError(
-            f"camera {absent[0]!r} has no image in any frame set; `intercap check` says why"
-        )
-
-
-def _require_evidence(rig: Rig, views: Views, board: Board | None) -> None:
-    """Raise UserError if neither a person nor the board is seen by two cameras."""
-    joints = (views.confidence[:, :, JOINTS] > 0).sum(2) >= MIN_SEEN
-    corners = (views.confidence[:, :, CORNERS] > 0).any(2)
-    people, boards = int(joints.any(0).sum()), int(corners.any(0).sum())
-    if board is not None and boards < 2:
-        names = [rig.names[c] for c in np.flatnonzero(corners.any(0))]
-        raise UserError(
-            f"the board is visible to {f'camera {names[0]} only' if names else 'no camera'}: check "
-            "the numbers of --board (columns, rows, dictionary), and hold the board still, close "
-            "and facing each camera, so that two cameras at a time see it"
-        )
-    if people < 2 and boards < 2:
-        raise UserError(
-            f"a person is detected by {people} of {len(rig)} cameras; name the folder of keypoints "
-            "in the table of sequences (or a keypoint model in the settings), let somebody walk "
-            "through the views, or show a board (--board)"
-        )
 
 
 def _lenses(
@@ -216,9 +177,10 @@ def _add_lens_errors(found: FoundRig) -> None:
 
 
 def _terms(
-    rig: Rig, views: Views, placed: Sequence[int], board: Board | None
+    rig: Rig, views: Views, board: Board | None, placed: Sequence[int] | None = None
 ) -> tuple[JointTerm, BoardTerm | None]:
-    """The terms of the adjustment with the ``placed`` cameras only."""
+    """The terms of the adjustment with all cameras, or with the ``placed`` ones only."""
+    placed = range(len(rig)) if placed is None else placed
     views = views.only(np.isin(np.arange(len(rig)), placed)[:, None])
     joints = JointTerm(rig, views, reference_points(rig, views, placed, None)[:, JOINTS])
     if board is None:
@@ -232,14 +194,14 @@ def _in_use(terms: tuple[JointTerm, BoardTerm | None]) -> list[Constraint]:
 
 def _place(
     rig: Rig, views: Views, board: Board | None, max_lag: int, frames: Frames, background: bool
-) -> tuple[FoundRig, Views, list[BoardTerm]]:
+) -> tuple[FoundRig, Views]:
     """Place and adjust all cameras, relative to the first of the rig.
 
-    Returns also the views with corrected lags, and the term of the board if two cameras see it.
+    Returns also the views with corrected lags.
     """
 
     def improve(at: Rig, seen: Views, placed: Sequence[int]) -> Rig:
-        terms = _in_use(_terms(at, seen, placed, board))
+        terms = _in_use(_terms(at, seen, board, placed))
         return at.moved(adjust(terms, at.master_from_colour, placed[1:], steps=8)[0])
 
     log.info("placing %d cameras", len(rig))
@@ -256,25 +218,19 @@ def _place(
         confirm_by_joints(rig, views, by_background)
         placed = sorted({*placed, *by_background})
     if len(placed) < len(rig):
-        raise UserError(_describe_unplaced(rig, placed, left))
+        raise UserError(describe_unplaced(rig, placed, left))
     rig = rig.moved(invert(rig[0].master_from_colour) @ rig.master_from_colour)
-    everyone = list(range(len(rig)))
-    terms = _terms(rig, views, everyone, board)
-    poses, covariance, _ = adjust(_in_use(terms), rig.master_from_colour, everyone[1:])
+    terms = _terms(rig, views, board)
+    free = range(1, len(rig))
+    poses, covariance, _ = adjust(_in_use(terms), rig.master_from_colour, free)
     rig = rig.moved(poses)
-    joints, boards = terms
-    walk = reference_points(rig, views, everyone, None)[:, HIPS].mean(1)
-    nothing = np.full(len(rig), np.nan)
     found = FoundRig(
         rig=rig,
         covariance=covariance + _shared_errors(rig, views, board),
-        joint_error_px=joints.errors_px(poses) if len(joints) else nothing,
-        corner_error_px=boards.errors_px(poses) if boards is not None and len(boards) else nothing,
+        residuals=measure_residuals(rig, views, *terms),
         joints=count_shared_joints(views),
         boards=(views.confidence[:, :, CORNERS] > 0).any(2).sum(0),
         lags=views.lags[0],
-        pairs=compare_pairs(rig, views, joints),
-        walk=walk,
         scale="",
         by_background=by_background,
         notes=[
@@ -283,7 +239,7 @@ def _place(
             for c, witnesses in sorted(by_background.items())
         ],
     )
-    return found, views, [boards] if boards is not None and len(boards) else []
+    return found, views
 
 
 def _shared_errors(rig: Rig, views: Views, board: Board | None) -> np.ndarray:
@@ -314,82 +270,17 @@ def _shared_errors(rig: Rig, views: Views, board: Board | None) -> np.ndarray:
     return total.reshape(len(rig), 6, len(rig), 6)
 
 
-def _describe_unplaced(rig: Rig, placed: Sequence[int], left: Sequence[Placement]) -> str:
-    """Message on the cameras that share too little with the others."""
-    names = rig.names
-    tried = {option.camera: option for option in left}
-    reasons = []
-    for c in range(len(rig)):
-        if c in placed:
-            continue
-        option = tried.get(c)
-        if option is None:
-            reasons.append(f"{names[c]} sees too few points that others know at the same time")
-        else:
-            reasons.append(
-                f"{names[c]}: {100 * option.share:.0f} % of {option.points} points agree"
-            )
-    known = ", ".join(names[c] for c in placed) or "none"
-    return (
-        f"not all cameras could be placed (placed: {known}; {'; '.join(reasons)}). Walk to and fro "
-        "where these cameras and a placed one see you at the same time, for ten seconds or more, "
-        "or show both a board; then calibrate again. The background places a camera only if two "
-        "other depth cameras see the same furniture. Nothing was written"
-    )
-
-
-def _check_walk(found: FoundRig, views: Views) -> None:
-    """Raise UserError if a camera without board and background shares no walk; note short walks."""
-    joints = (views.confidence[:, :, JOINTS] > 0).sum(2) >= MIN_SEEN
-    common = joints & (joints.sum(1, keepdims=True) >= 2) & np.isfinite(found.walk[:, :1])
-    for c in np.flatnonzero(found.boards == 0).tolist():
-        if c in found.by_background:
-            continue
-        rows = common[:, c]
-        extent = lasts = 0.0
-        if rows.any():
-            low, high = np.quantile(found.walk[rows], (0.02, 0.98), axis=0)
-            extent = float(np.linalg.norm(high - low))
-            own = [views.times[rows & (views.recording == k)] for k in np.unique(views.recording)]
-            lasts = max(float(np.ptp(times)) for times in own if len(times))
-        if extent < MIN_WALK_M or lasts < MIN_WALK_S:
-            raise UserError(
-                f"camera {found.rig.names[c]} and another one see the person together for "
-                f"{lasts:.1f} s and {extent:.2f} m of its way, expected at least {MIN_WALK_S:g} s "
-                f"and {MIN_WALK_M:g} m: let the person walk through the whole area that the "
-                "cameras share, or show a board. Nothing was written"
-            )
-        if lasts < SURE_WALK_S:
-            found.notes.append(
-                f"camera {found.rig.names[c]} and another one see the person together for only "
-                f"{lasts:.1f} s: its error may be larger than estimated; let the person walk for "
-                "ten seconds"
-            )
-
-
-def _check_agreement(found: FoundRig) -> None:
-    """Raise UserError if the joints or corners of a camera contradict its pose."""
-    for points, errors in (("joints", found.joint_error_px), ("corners", found.corner_error_px)):
-        usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else np.inf
-        for c in np.flatnonzero(errors > MAX_ERROR_RATIO * usual).tolist():
-            raise UserError(
-                f"camera {found.rig.names[c]}: its {points} are {errors[c]:.1f} px from where the "
-                f"other cameras see them, whose median is {usual:.1f} px. Its keypoints may be of "
-                "another person or have left and right exchanged, its lens may be wrong, or it was "
-                "moved; correct that and calibrate again. Nothing was written"
-            )
-
-
 def _refine(
-    found: FoundRig, frames: Frames, people: PeopleOfImages, terms: Sequence[BoardTerm]
+    found: FoundRig, frames: Frames, people: PeopleOfImages, boards: BoardTerm | None
 ) -> None:
-    """Refine the poses on depth surfaces, in place.
+    """Refine the poses on depth surfaces, joints and ``boards``, in place.
 
     Raises UserError if surfaces do not confirm the cameras that were placed by their background.
     """
     if sum(camera.depth is not None for camera in found.rig) < 2:
         return
     log.info("registering surfaces")
+    terms = [boards] if boards else []
     for first in (True, False):  # the second time, people and backgrounds are found at better poses
         refined = refine_on_surfaces(frames.at(found.rig), people, 0, terms)
         if refined is None:
@@ -405,20 +296,3 @@ def _refine(
         found.covariance = add_scale_sigma(refined.covariance, poses, sigma)
         before, after = refined.surfaces_mm
         log.info("surfaces: %.1f to %.1f mm apart", before, after)
-
-
-def _check_gravity(rig: Rig, gravity: np.ndarray) -> None:
-    """Raise UserError if the gravity sensors contradict the rotations of the cameras."""
-    measured = np.flatnonzero(np.isfinite(gravity).all(1))
-    if len(measured) < 2:
-        return
-    down = np.einsum("cij,cj->ci", rig.master_from_colour[measured, :3, :3], gravity[measured])
-    middle = np.median(down, axis=0)
-    off = np.degrees(np.arccos(np.clip(down @ (middle / np.linalg.norm(middle)), -1, 1)))
-    worst = int(off.argmax())
-    if off[worst] > MAX_GRAVITY_DEG:
-        raise UserError(
-            f"camera {rig.names[measured[worst]]}: its gravity sensor contradicts its found pose "
-            f"by {off[worst]:.0f} degrees, expected at most {MAX_GRAVITY_DEG:g}; record a longer "
-            "walk in the common view, or show a board. Nothing was written"
-        )

@@ -112,7 +112,7 @@ def rescale(
     covariance = found.covariance.copy()
     covariance[:, 3:] *= scale
     covariance[:, :, :, 3:] *= scale
-    found.rig, found.walk = rig.moved(poses), scale * found.walk
+    found.rig = rig.moved(poses)
     found.covariance = add_scale_sigma(fix_scale(covariance, poses, length), poses, sigma)
 
 

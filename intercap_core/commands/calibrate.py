@@ -162,9 +162,9 @@ def _rows(found: FoundRig) -> list[dict[str, str]]:
             "name": name,
             "sigma": "reference" if c == 0 else f"{1e3 * found.sigma_m(c):.1f}",
             "joints": str(found.joints[c]),
-            "joint_error": number(found.joint_error_px[c]),
+            "joint_error": number(found.residuals.joint_px[c]),
             "boards": str(found.boards[c] or ""),
-            "corner_error": number(found.corner_error_px[c]),
+            "corner_error": number(found.residuals.corner_px[c]),
             "lag": str(found.lags[c] or ""),
         }
         for c, name in enumerate(found.rig.names)

@@ -21,7 +21,7 @@ from intercap_core.calibrate.adjust import (
     jackknife_covariance,
 )
 from intercap_core.calibrate.evidence import CORNERS, NUM_JOINTS
-from intercap_core.calibrate.found_rig import FoundRig
+from intercap_core.calibrate.found_rig import FoundRig, Residuals
 from intercap_core.calibrate.scale import fix_scale
 from intercap_core.formats.calibration.boards import parse_board
 from intercap_core.geometry.camera.rig import Rig, ring_centre
@@ -219,7 +219,8 @@ def test_the_estimated_error_is_the_mean_displacement_of_sampled_poses() -> None
     covariance = np.zeros((2, 6, 2, 6))
     covariance[1, :, 1] = root @ root.T
     nothing = np.full(2, np.nan)
-    found = FoundRig(rig, covariance, *[nothing] * 5, [], np.zeros((0, 3)), "")
+    residuals = Residuals(nothing, nothing, [], np.zeros((0, 3)))
+    found = FoundRig(rig, covariance, residuals, *[nothing] * 3, "")
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3)  # their covariance
     cube = ring_centre(rig) + corners
     steps = random.normal(size=(4000, 6)) @ root.T

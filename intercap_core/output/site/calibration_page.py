@@ -31,7 +31,7 @@ def calibration_page(
             pair.boards or "",
             "–" if np.isnan(pair.error_px) else f"{pair.error_px:.1f}",
         )
-        for pair in found.pairs
+        for pair in found.residuals.pairs
     ]
     return embed.render(
         "calibration.html.j2",
@@ -57,7 +57,8 @@ def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     axes = np.stack([np.cross(ahead, up), ahead if side == 0 else up])  # right, upwards (2, 3)
     poses = found.rig.master_from_colour
-    walk = found.walk[np.isfinite(found.walk[:, 0])]
+    walk = found.residuals.walk
+    walk = walk[np.isfinite(walk[:, 0])]
     corners = []
     for camera, pose in zip(found.rig, poses, strict=True):
         lens = camera.colour
