@@ -221,6 +221,11 @@ class BoardTerm:
         """Median reprojection error (C,) of each camera, pixels of a 1080p image; NaN = none."""
         return self._corner_pixels(poses)[1].median()
 
+    def sizes_px(self, poses: np.ndarray) -> np.ndarray:
+        """Reprojection errors (B * N, C) of all corners, pixels of a 1080p image; NaN = unseen."""
+        pixel = self._corner_pixels(poses)[1]
+        return np.where(pixel.known, pixel.size, np.nan)
+
     def _corner_pixels(self, poses: np.ndarray) -> tuple[np.ndarray, _Pixels]:
         """Corners (B, N, 3) relative to their board's origin, and their reprojection errors."""
         arms = np.einsum("bij,nj->bni", self.boards[:, :3, :3], self._corners)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -13,7 +14,7 @@ from intercap_core.calibrate.evidence import CORNERS, JOINTS, Views
 from intercap_core.calibrate.lenses import LensEstimate
 from intercap_core.calibrate.placement import reference_points
 from intercap_core.geometry.camera.rig import Rig, ring_centre
-from intercap_core.scene.camera_verdicts import covariance_at
+from intercap_core.scene.camera_verdicts import shift_by_pose
 
 WEAK_M = 0.03  # estimated error from which a camera is called weak
 CUBE_M = 2.0  # side of the cube whose points are displaced, as in the evaluation
@@ -22,15 +23,19 @@ _HIPS = [KEYPOINT_INDEX["left_hip"], KEYPOINT_INDEX["right_hip"]]
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """How well two cameras agree."""
+    """How well two cameras agree, by kind of evidence."""
 
     cameras: tuple[int, int]
     joints: int
     """Number of joints that both see at one time."""
     boards: int
     """Number of sets in which both see the board."""
-    error_px: float
+    joint_px: float
     """Median reprojection error of these joints in both, pixels of a 1080p image; NaN = none."""
+    corner_px: float
+    """The same of the board's corners."""
+    background_m: float
+    """Median distance of held-out points of the background's surface, metres; NaN = none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +75,27 @@ class FoundRig:
     """Estimated or refined lenses by camera."""
 
     def sigma_m(self, camera: int) -> float:
-        """Root mean square displacement of a 2 m cube at the rig's centre as the camera sees it.
+        """Standard deviation of a camera relative to the master, see :meth:`pair_sigma_m`."""
+        return self.pair_sigma_m(0, camera)
 
-        Of a point x of the cube at c, the displacement by an error (w, v) of the pose with centre t
-        is w x (x - t) + v. Its mean square is that at c plus |w|^2 times a sixth of the squared
-        side.
+    def pair_sigma_m(self, a: int, b: int) -> float:
+        """Root mean square displacement of a 2 m cube as camera a sees it from camera b's view.
+
+        The cube is at the rig's centre c. An error (w, v) of a pose with centre t displaces a point
+        x by w x (x - t) + v. The difference of both cameras' displacements has the mean square of
+        that at c, plus |w_a - w_b|^2 times a sixth of the squared side.
         """
-        pose = self.rig.master_from_colour[camera]
-        block = self.covariance[camera, :, camera]
-        variance = np.trace(covariance_at(block, pose, ring_centre(self.rig)))
-        return float(np.sqrt(variance + CUBE_M**2 / 6 * np.trace(block[:3, :3])))
+        poses, centre = self.rig.master_from_colour, ring_centre(self.rig)
+        shift = [shift_by_pose(poses[c], centre) for c in (a, b)]
+        turn = np.eye(3, 6)
+        by_errors = np.concatenate(
+            [
+                np.concatenate([shift[0], -shift[1]], 1),
+                np.sqrt(CUBE_M**2 / 6) * np.concatenate([turn, -turn], 1),
+            ]
+        )
+        block = self.covariance[[a, b]][:, :, [a, b]].reshape(12, 12)
+        return float(np.sqrt(np.trace(by_errors @ block @ by_errors.T)))
 
 
 def count_shared_joints(views: Views) -> np.ndarray:
@@ -89,33 +105,44 @@ def count_shared_joints(views: Views) -> np.ndarray:
 
 
 def measure_residuals(
-    rig: Rig, views: Views, joints: JointTerm, boards: BoardTerm | None
+    rig: Rig,
+    views: Views,
+    joints: JointTerm,
+    boards: BoardTerm | None,
+    background_m: Mapping[tuple[int, int], float] | None = None,
 ) -> Residuals:
-    """Residuals at the poses of ``rig``, to which the points of both terms are first adapted."""
+    """Residuals at the poses of ``rig``, to which the points of both terms are first adapted.
+
+    Args:
+        background_m: median distances of the background's surface by pair; None = unknown.
+    """
     poses, nothing = rig.master_from_colour, np.full(len(rig), np.nan)
     for term in (joints, boards):
         if term:
             term(poses, np.zeros(len(rig)))
     walk = reference_points(rig, views, list(range(len(rig))), None)[:, _HIPS].mean(1)
+    seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
+    with_board = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
+    pairs = [
+        Pair(
+            (a, b),
+            joints=int((seen[:, a] & seen[:, b]).sum()),
+            boards=int((with_board[:, a] & with_board[:, b]).sum()),
+            joint_px=_median_in_both(joints.sizes_px(poses)[:, [a, b]]),
+            corner_px=_median_in_both(boards.sizes_px(poses)[:, [a, b]]) if boards else np.nan,
+            background_m=(background_m or {}).get((a, b), np.nan),
+        )
+        for a, b in combinations(range(len(rig)), 2)
+    ]
     return Residuals(
         joint_px=joints.errors_px(poses) if joints else nothing,
         corner_px=boards.errors_px(poses) if boards else nothing,
-        pairs=_compare_pairs(rig, views, joints),
+        pairs=pairs,
         walk=walk,
     )
 
 
-def _compare_pairs(rig: Rig, views: Views, joints: JointTerm) -> list[Pair]:
-    """Agreement of every pair of cameras with common joints or boards."""
-    seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
-    boards = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
-    sizes = joints.sizes_px(rig.master_from_colour)
-    pairs = []
-    for a, b in combinations(range(len(rig)), 2):
-        own = sizes[:, [a, b]]
-        own = own[np.isfinite(own).all(1)]
-        error = float(np.median(own)) if len(own) else np.nan
-        common = int((seen[:, a] & seen[:, b]).sum()), int((boards[:, a] & boards[:, b]).sum())
-        if any(common):
-            pairs.append(Pair((a, b), *common, error))
-    return pairs
+def _median_in_both(sizes: np.ndarray) -> float:
+    """Median of errors (N, 2) of points that both cameras see; NaN = none."""
+    both = sizes[np.isfinite(sizes).all(1)]
+    return float(np.median(both)) if len(both) else np.nan

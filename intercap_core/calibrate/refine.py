@@ -37,6 +37,8 @@ class Refined:
     """(C, 6, C, 6) of rotations about the cameras' centres and translations; 0 = fixed."""
     surfaces_mm: tuple[float, float]
     """Mean over pairs of cameras of the median distance of held-out points, before and after."""
+    background_m: dict[tuple[int, int], float]
+    """Median distance of held-out points of the background by pair (a, b), a < b, metres."""
 
 
 def refine_on_surfaces(
@@ -72,4 +74,10 @@ def refine_on_surfaces(
     if not after < before:
         return None
     covariance = SHARED_ERRORS * found.covariance[:, :6, :, :6]
-    return Refined(found.estimate.poses, covariance, (before, after))
+    background = registration.median_residuals(found.estimate, STATIC)
+    return Refined(
+        found.estimate.poses,
+        covariance,
+        (before, after),
+        {(min(pair), max(pair)): median for pair, median in background.items()},
+    )

@@ -47,6 +47,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.scene.background import camera_background
+from intercap_core.scene.camera_verdicts import shift_by_pose
 from intercap_core.scene.registration import Constraint
 from intercap_core.scene.start_times import MAX_DELAY_S
 
@@ -111,10 +112,12 @@ def find_poses(
         if metric and board is not None and found.boards.any():
             found.scale = "board" if not _has_depth(views) else "board and depth"
         check_agreement(found)
-        _refine(found, opened[0], people[0], _terms(found.rig, views, board)[1])
+        terms = _terms(found.rig, views, board)
+        background_m = _refine(found, opened[0], people[0], terms[1])
         if distance is not None or not metric:
             rescale(found, views, distance, height_m)
-        found.residuals = measure_residuals(found.rig, views, *_terms(found.rig, views, board))
+        terms = _terms(found.rig, views, board)
+        found.residuals = measure_residuals(found.rig, views, *terms, background_m)
         check_agreement(found)
         check_walk(found, views)
         check_gravity(found.rig, opened[0].gravity)
@@ -160,7 +163,7 @@ def _add_lens_errors(found: FoundRig) -> None:
     """Add the errors of estimated lenses to the covariance, in place.
 
     A wrong focal length moves the camera along its view, a wrong principal point turns it. The
-    master's errors move all others.
+    master's errors move all others together.
     """
     centre = ring_centre(found.rig)
     for c, camera in enumerate(found.rig):
@@ -172,8 +175,15 @@ def _add_lens_errors(found: FoundRig) -> None:
         own = np.zeros((6, 6))
         own[:3, :3] = lens.centre_sigma**2 * np.eye(3)
         own[3:, 3:] = along**2 * np.outer(pose[:3, 2], pose[:3, 2])
-        for other in range(1, len(found.rig)) if c == 0 else (c,):
-            found.covariance[other, :, other] += own
+        if c:
+            found.covariance[c, :, c] += own
+            continue
+        others = found.rig.master_from_colour[1:, :3, 3]
+        by_master = np.concatenate(
+            [np.concatenate([np.eye(3, 6), shift_by_pose(pose, other)]) for other in others]
+        )
+        shared = by_master @ own @ by_master.T
+        found.covariance[1:, :, 1:] += shared.reshape(len(others), 6, len(others), 6)
 
 
 def _terms(
@@ -272,13 +282,15 @@ def _shared_errors(rig: Rig, views: Views, board: Board | None) -> np.ndarray:
 
 def _refine(
     found: FoundRig, frames: Frames, people: PeopleOfImages, boards: BoardTerm | None
-) -> None:
+) -> dict[tuple[int, int], float]:
     """Refine the poses on depth surfaces, joints and ``boards``, in place.
 
-    Raises UserError if surfaces do not confirm the cameras that were placed by their background.
+    Returns the median distance of held-out points of the background by pair, metres. Raises
+    UserError if surfaces do not confirm the cameras that were placed by their background.
     """
+    background_m: dict[tuple[int, int], float] = {}
     if sum(camera.depth is not None for camera in found.rig) < 2:
-        return
+        return background_m
     log.info("registering surfaces")
     terms = [boards] if boards else []
     for first in (True, False):  # the second time, people and backgrounds are found at better poses
@@ -290,9 +302,11 @@ def _refine(
                     "of them agree; let a person walk through the common view, or show a board. "
                     "Nothing was written"
                 )
-            return
+            return background_m
+        background_m = refined.background_m
         found.rig = found.rig.moved(refined.poses)
         poses, sigma = found.rig.master_from_colour, DEPTH_SCALE_SIGMA
         found.covariance = add_scale_sigma(refined.covariance, poses, sigma)
         before, after = refined.surfaces_mm
         log.info("surfaces: %.1f to %.1f mm apart", before, after)
+    return background_m

@@ -172,9 +172,14 @@ def covariance_at(covariance: np.ndarray, pose: np.ndarray, point: np.ndarray) -
 
     Arguments as in :func:`weakest_motion`; ``point`` (3,) in the master frame, metres.
     """
-    across = np.cross(np.eye(3), point - pose[:3, 3])  # row i: the shift by a turn about axis i
-    by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
+    by_pose = shift_by_pose(pose, point)
     return np.asarray(by_pose @ covariance[:6, :6] @ by_pose.T)
+
+
+def shift_by_pose(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Displacement (3, 6) of a ``point`` (3,) by a rotation about the camera and a translation."""
+    across = np.cross(np.eye(3), point - pose[:3, 3])  # row i: the shift by a turn about axis i
+    return np.concatenate([across.T, np.eye(3)], axis=1)
 
 
 def weakest_motion(

@@ -227,3 +227,22 @@ def test_the_estimated_error_is_the_mean_displacement_of_sampled_poses() -> None
     moved = apply_step(np.broadcast_to(poses[1], (4000, 4, 4)), steps) @ invert(poses[1])
     square = [((apply(pose, cube) - cube) ** 2).sum(1).mean() for pose in moved]
     assert found.sigma_m(1) == pytest.approx(np.sqrt(np.mean(square)), rel=0.05)
+
+
+def test_the_estimated_error_of_a_pair_is_that_between_two_cameras() -> None:
+    """Errors that both cameras share do not displace one relative to the other."""
+    rig, _, _ = views_of_walker(3, 2)
+    poses, random = rig.master_from_colour, np.random.default_rng(0)
+    root = 1e-3 * random.normal(size=(12, 12))
+    covariance = np.zeros((3, 6, 3, 6))
+    covariance[1:, :, 1:] = (root @ root.T).reshape(2, 6, 2, 6)
+    nothing = np.full(3, np.nan)
+    residuals = Residuals(nothing, nothing, [], np.zeros((0, 3)))
+    found = FoundRig(rig, covariance, residuals, *[nothing] * 3, "")
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3)  # their covariance
+    cube = ring_centre(rig) + corners
+    steps = (random.normal(size=(4000, 12)) @ root.T).reshape(-1, 2, 6)
+    moved = apply_step(np.broadcast_to(poses[1:], (4000, 2, 4, 4)), steps) @ invert(poses[1:])
+    apart = [((apply(a, cube) - apply(b, cube)) ** 2).sum(1).mean() for a, b in moved]
+    assert found.pair_sigma_m(1, 2) == pytest.approx(np.sqrt(np.mean(apart)), rel=0.05)
+    assert found.pair_sigma_m(0, 1) == found.sigma_m(1)

@@ -27,9 +27,12 @@ def calibration_page(
     pairs = [
         (
             " and ".join(found.rig.names[c] for c in pair.cameras),
+            f"{1e3 * found.pair_sigma_m(*pair.cameras):.1f}",
             pair.joints,
+            _number(pair.joint_px),
             pair.boards or "",
-            "–" if np.isnan(pair.error_px) else f"{pair.error_px:.1f}",
+            _number(pair.corner_px),
+            _number(1e3 * pair.background_m),
         )
         for pair in found.residuals.pairs
     ]
@@ -88,3 +91,7 @@ def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
 def _points(places: np.ndarray) -> str:
     """Points (N, 2) of an SVG shape."""
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+
+
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.1f}"
