@@ -46,9 +46,12 @@ class BagFile:
     def __exit__(self, *error: object) -> None:
         self._writer.close()
 
-    def compress(self, mode: rosbag2.CompressionMode, form: rosbag2.CompressionFormat) -> None:
-        """Compress a bag of ROS 2; call before the ``with`` block."""
-        self._writer.set_compression(mode, form)
+    def compress(self, *how: Any) -> None:
+        """Compress the bag, by a format of ROS 1 or by mode and format of ROS 2.
+
+        Call before the ``with`` block.
+        """
+        self._writer.set_compression(*how)
 
     def make(self, name: str, **fields: Any) -> Any:
         return self.store.types[name](**fields)

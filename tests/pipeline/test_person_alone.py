@@ -20,6 +20,7 @@ from intercap_core.commands.inspect import print_summary
 from intercap_core.commands.pictures import draw_closeups
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
+from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.joint.problem import TERMS
 from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.term import Data
@@ -267,6 +268,21 @@ def test_a_script_and_an_object_must_fit(project: Project, tmp_path: Path) -> No
         str(fault) for fault in check_sequences(load_project(tmp_path / "config.yaml")).faults
     ]
     assert any("needs no object, the sequence has 'cup'" in line for line in faults)
+
+
+def test_release_asks_for_consent_if_a_real_person_was_recorded(
+    project: Project, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    read = SequenceSummary.read
+
+    def without_truth(path: Path) -> SequenceSummary:
+        summary = read(path)
+        return replace(summary, metrics=replace(summary.metrics, has_truth=False))
+
+    monkeypatch.setattr(SequenceSummary, "read", staticmethod(without_truth))
+    write_release(project, ["card"])
+    assert "datasheet.md has placeholders: set card." in caplog.text
+    assert "card.collection, card.consent" in caplog.text and str(project.path) in caplog.text
 
 
 def test_release_lists_and_verifies_its_files(

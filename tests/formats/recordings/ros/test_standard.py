@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from rosbags import rosbag1, rosbag2
 
 from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
@@ -94,6 +96,45 @@ def test_two_cameras_of_one_bag_are_read(tmp_path: Path, form: Form) -> None:
     colour = [decoded(image.content) for image in images if image.kind == "colour"]
     assert all(np.abs(colour[t].astype(int) - colour_image(t)).mean() < 2 for t in range(4))
     assert "stored as JPEG" in " ".join(recording.notes)
+
+
+ZSTD = rosbag2.CompressionFormat.ZSTD
+
+
+@pytest.mark.parametrize(
+    ("form", "how"),
+    [
+        ("bag", (rosbag1.Writer.CompressionFormat.LZ4,)),
+        ("bag", (rosbag1.Writer.CompressionFormat.BZ2,)),
+        ("mcap", (rosbag2.CompressionMode.STORAGE, ZSTD)),
+        ("mcap", (rosbag2.CompressionMode.MESSAGE, ZSTD)),
+        ("db3", (rosbag2.CompressionMode.MESSAGE, ZSTD)),
+        ("db3", (rosbag2.CompressionMode.FILE, ZSTD)),
+    ],
+    ids=str,
+)
+def test_compressed_bags_have_the_same_images(
+    tmp_path: Path, form: Form, how: tuple[Any, ...]
+) -> None:
+    images, sizes = [], []
+    for name, compression in (("plain", ()), ("compressed", how)):
+        folder = tmp_path / name
+        folder.mkdir()
+        written = BagFile(place_of(folder, form, "walk"), form)
+        if compression:
+            written.compress(*compression)
+        with written as bag:
+            write_camera(bag, images=20)
+        assert recognise_recordings(folder) == ("ros", ["k1"])
+        images.append(read(folder, "k1"))
+        sizes.append(sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()))
+    plain, compressed = images
+    assert sizes[1] < sizes[0]
+    for kind, expected in plain.items():
+        assert len(expected) == 20
+        for image, other in zip(expected, compressed[kind], strict=True):
+            assert image.time_us == other.time_us
+            assert np.array_equal(np.asarray(image.content), np.asarray(other.content))
 
 
 def test_files_of_one_camera_each_are_named_by_the_file(tmp_path: Path) -> None:
