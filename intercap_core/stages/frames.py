@@ -24,7 +24,6 @@ from intercap_core.formats.recordings.extract import ExtractedCamera, extract
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.sound_delays import sound_starts
 from intercap_core.formats.recordings.synchronise import (
-    LONG_STEP_US,
     OUTLIER,
     SetTable,
     choose_epoch,
@@ -312,21 +311,7 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
     """Note gaps, other frame rates, unmatched images, clock drift, and late or early ends."""
     period_us = 1e6 / views[clock].fps
     sets_per_s = frame_rate(table.times_us) or views[clock].fps
-    gaps = table.gaps(period_us)
-    if gaps:
-        lost = sum(length for _, length in gaps)
-        note = (
-            f"no camera has an image for {lost} periods in {len(gaps)} places, the first after "
-            f"frame set {gaps[0][0]}"
-        )
-        longest, length = max(gaps, key=lambda gap: gap[1])
-        if length * period_us > LONG_STEP_US:
-            note += (
-                f"; after frame set {longest} for {length * period_us / 1e6:.1f} s: unless the "
-                "recording was paused, the cameras' common clock was set ahead; set no clock (NTP, "
-                "PTP) during a recording"
-            )
-        views[clock].notes.append(note)
+    views[clock].notes += table.describe_gaps(period_us)
     for camera, view in enumerate(views):
         if not view.present:
             continue

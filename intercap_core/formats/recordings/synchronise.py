@@ -15,6 +15,9 @@ import numpy as np
 # In periods: an image that is farther from every set starts a new set. More than half, so that no
 # set starts between two regular ones.
 NEW_SET_GAP = 0.6
+# A longer step from one image to the next is a pause of the recording or a jump of the clock,
+# microseconds. Cameras that people stop by hand end within a few seconds of each other.
+LONG_STEP_US = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,24 @@ class SetTable:
         """Gaps in which no camera has an image: (set before the gap, number of missing sets)."""
         steps = np.rint(np.diff(self.times_us) / period_us).astype(int)
         return [(int(at), int(steps[at]) - 1) for at in np.flatnonzero(steps > 1)]
+
+    def describe_gaps(self, period_us: float) -> list[str]:
+        """A note on :meth:`gaps`; [] without any."""
+        gaps = self.gaps(period_us)
+        if not gaps:
+            return []
+        note = (
+            f"no camera has an image for {sum(length for _, length in gaps)} periods in "
+            f"{len(gaps)} places, the first after frame set {gaps[0][0]}"
+        )
+        longest, length = max(gaps, key=lambda gap: gap[1])
+        if length * period_us > LONG_STEP_US:
+            note += (
+                f"; after frame set {longest} for {length * period_us / 1e6:.1f} s: unless the "
+                "recording was paused, the cameras' common clock was set ahead; set no clock (NTP, "
+                "PTP) during a recording"
+            )
+        return [note]
 
 
 def synchronise(
@@ -211,11 +232,6 @@ def choose_epoch(
         return int(np.argmax(np.bincount(epoch[epoch >= 0])))
     counts = np.bincount(epoch[near])
     return int(np.argmax(counts >= counts.max() * 0.5))
-
-
-# A longer step from one image to the next is a pause of the recording or a jump of the clock,
-# microseconds. Cameras that people stop by hand end within a few seconds of each other.
-LONG_STEP_US = 10_000_000
 
 
 class ClockJump(NamedTuple):
