@@ -1,6 +1,7 @@
 """Public recordings of real cameras: `intercap calibrate`, and the reader of RealSense's bags.
 
     python -m bench.real_rigs pose2sim CLONE
+    python -m bench.real_rigs caliscope CLONE
     python -m bench.real_rigs azure_kinect CLONE
     python -m bench.real_rigs realsense CLONE
 
@@ -9,6 +10,9 @@ CLONE is a git clone with its history. Files are extracted into ``results/real_r
 - ``pose2sim``: demonstration of github.com/perfanalytics/pose2sim. Four cameras without depth; a
   person walks on a beam, another person stands in the background. OpenPose's keypoints (BODY_25B)
   are those of release v0.4.0, lenses and reference poses those of Qualisys.
+- ``caliscope``: four-camera session in the tests of github.com/mprib/caliscope. Four webcams, a
+  ChArUco board printed white on black. Lenses and reference poses are those of its
+  ``camera_array.toml``.
 - ``azure_kinect``: example of github.com/microsoft/Azure-Kinect-Sensor-SDK. 30 colour images of a
   ChArUco board; the first was taken together with an infrared image.
 - ``realsense``: bag of a D435 (2018) in the unit tests of github.com/realsenseai/librealsense, with
@@ -25,6 +29,7 @@ import shutil
 import subprocess
 import tarfile
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +48,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.project import load_project
 
 SEQUENCE = "take"
+CALISCOPE_BOARD = "charuco:4x5:0.054:0.0405:4X4_1000"  # charuco.toml
 KINECT_BOARD = "charuco:14x9:0.04:0.03:5X5_250"  # PlaneFiles/plane.json
 
 
@@ -63,6 +69,34 @@ def pose2sim(clone: Path, folder: Path) -> None:
         }
     _write_project(folder, keypoints=True)
     found = _calibrate(folder, {"cameras": lenses}, board=None)
+    _print_differences(found, reference)
+
+
+def caliscope(clone: Path, folder: Path) -> None:
+    """Find the poses by the board, and compare them with caliscope's after a similarity."""
+    session = "tests/sessions/4_cam_recording"
+    for path in ("calibration/extrinsic", "camera_array.toml"):
+        _extract(clone, "HEAD", folder / "theirs", f"{session}/{path}")
+    theirs = folder / "theirs" / session
+    shutil.copytree(
+        theirs / "calibration" / "extrinsic",
+        folder / "recordings",
+        ignore=shutil.ignore_patterns("*.csv"),
+    )
+    lenses, posed = {}, {}
+    cameras = tomllib.loads((theirs / "camera_array.toml").read_text())["cameras"]
+    for number, camera in cameras.items():
+        lens = {
+            "image_size": camera["size"],
+            "camera_matrix": camera["matrix"],
+            "distortion_coefficients": camera["distortions"],
+        }
+        lenses[f"cam_{number}"] = lens
+        posed[f"cam_{number}"] = lens | {"R": camera["rotation"], "T": camera["translation"]}
+    reference = folder / "reference.json"
+    reference.write_text(json.dumps({"master": "cam_1", "cameras": posed}))
+    _write_project(folder, keypoints=False)
+    found = _calibrate(folder, {"master": "cam_1", "cameras": lenses}, board=CALISCOPE_BOARD)
     _print_differences(found, reference)
 
 
@@ -216,7 +250,12 @@ def _print_differences(found: Path, reference: Path) -> None:
     print(f"scale of the reference over ours: {scale:.3f}")
 
 
-DATA = {"pose2sim": pose2sim, "azure_kinect": azure_kinect, "realsense": realsense}
+DATA = {
+    "pose2sim": pose2sim,
+    "caliscope": caliscope,
+    "azure_kinect": azure_kinect,
+    "realsense": realsense,
+}
 
 
 def main() -> None:

@@ -47,8 +47,13 @@ class Residuals:
     corner_px: np.ndarray
     """(C,) the same of the board's corners."""
     pairs: list[Pair]
-    walk: np.ndarray
-    """(T, 3) middle of the person's hips, master frame, metres; NaN = unknown."""
+    body: np.ndarray
+    """(T, 25, 3) joints of the person, master frame, metres; NaN = unknown."""
+
+    @property
+    def walk(self) -> np.ndarray:
+        """(T, 3) middle of the person's hips, master frame, metres; NaN = unknown."""
+        return np.asarray(self.body[:, _HIPS].mean(1))
 
 
 @dataclass(eq=False)
@@ -68,6 +73,8 @@ class FoundRig:
     """(C,) sets by which the images of the first recording are late."""
     scale: str
     """What determines the scale."""
+    scale_sigma: float = 0.0
+    """Relative standard deviation of the scale, as far as it is common to all poses."""
     by_background: dict[int, frozenset[int]] = field(default_factory=dict)
     """Cameras placed by the static background, with the cameras that agree on their poses."""
     notes: list[str] = field(default_factory=list)
@@ -120,7 +127,7 @@ def measure_residuals(
     for term in (joints, boards):
         if term:
             term(poses, np.zeros(len(rig)))
-    walk = reference_points(rig, views, list(range(len(rig))), None)[:, _HIPS].mean(1)
+    body = reference_points(rig, views, list(range(len(rig))), None)[:, JOINTS]
     seen = np.isfinite(views.pixels[:, :, JOINTS, 0])
     with_board = np.isfinite(views.pixels[:, :, CORNERS, 0]).any(2)
     pairs = [
@@ -138,7 +145,7 @@ def measure_residuals(
         joint_px=joints.errors_px(poses) if joints else nothing,
         corner_px=boards.errors_px(poses) if boards else nothing,
         pairs=pairs,
-        walk=walk,
+        body=body,
     )
 
 

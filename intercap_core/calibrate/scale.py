@@ -102,17 +102,12 @@ def rescale(
             )
         stated = f"{height_m:.2f} m" if height_m else "unknown, taken as 1.70 m"
         found.scale = f"the subject's height ({stated})"
-        if not height_m:
-            found.notes.append(
-                f"the scale is known to {100 * sigma:.0f} % only: state the subject's height in "
-                "the table of subjects, or the distance of two cameras (--distance)"
-            )
     poses = rig.master_from_colour.copy()
     poses[:, :3, 3] *= scale
     covariance = found.covariance.copy()
     covariance[:, 3:] *= scale
     covariance[:, :, :, 3:] *= scale
-    found.rig = rig.moved(poses)
+    found.rig, found.scale_sigma = rig.moved(poses), sigma
     found.covariance = add_scale_sigma(fix_scale(covariance, poses, length), poses, sigma)
 
 

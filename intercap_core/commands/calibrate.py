@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from intercap_core.calibrate.advice import advise, describe_floor
 from intercap_core.calibrate.draft import RigDraft, draft_rig, write_calibration
-from intercap_core.calibrate.found_rig import WEAK_M, FoundRig
+from intercap_core.calibrate.found_rig import FoundRig
 from intercap_core.calibrate.rig_poses import find_poses
 from intercap_core.commands.console import ListTable, print_plain, standard_console
 from intercap_core.entries import SequenceEntry
@@ -19,7 +20,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.output.site.calibration_page import calibration_page
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project
-from intercap_core.scene.up import rough_up
+from intercap_core.scene.floor import floor_under_feet
 
 
 def calibrate(
@@ -72,14 +73,15 @@ def calibrate(
         background=background,
     )
     with Frames.open(paths[0][0]) as frames:
-        up = rough_up(found.rig, frames.gravity).direction
-    rows, advice = _rows(found), advise(found)
+        ground, up = floor_under_feet(found.rig, found.residuals.body, frames.gravity)
+    rows, advice = _rows(found), advise(found, ground, up.direction)
+    floor = describe_floor(ground, up.source, up.deviation_deg, found.rig.names[0])
     page = project.results / "calibrate" / sequence / "calibration.html"
-    html = calibration_page(sequence, found, up, rows, advice)
+    html = calibration_page(sequence, found, up.direction, rows, advice, floor)
     order = [found.rig.names.index(name) for name in draft.names]
     write_calibration(path, _with_lenses(draft, found), found.rig.master_from_colour[order])
     page.write_text(html, encoding="utf-8")
-    _print(rows, found, advice)
+    _print(rows, [f"scale by {found.scale}", floor, *(item.text for item in advice)])
     return path, page
 
 
@@ -171,25 +173,7 @@ def _rows(found: FoundRig) -> list[dict[str, str]]:
     ]
 
 
-def advise(found: FoundRig) -> list[str]:
-    """Notes, and for each weak camera where to walk or to hold the board."""
-    advice = list(found.notes)
-    names, poses = found.rig.names, found.rig.master_from_colour
-    for c in range(1, len(names)):
-        if found.sigma_m(c) <= WEAK_M:
-            continue
-        # the camera whose view makes the largest useful angle with this one's
-        cosine = poses[:, :3, 2] @ poses[c, :3, 2]
-        partner = int(np.argmin(np.abs(np.where(np.arange(len(names)) == c, np.inf, cosine - 0.3))))
-        advice.append(
-            f"{names[c]} is known to {1e3 * found.sigma_m(c):.0f} mm only: walk to and fro where "
-            f"{names[c]} and {names[partner]} both see the whole body, at several distances, or "
-            "hold a board where both see it"
-        )
-    return advice
-
-
-def _print(rows: list[dict[str, str]], found: FoundRig, advice: list[str]) -> None:
+def _print(rows: list[dict[str, str]], lines: list[str]) -> None:
     console = standard_console()
     table = ListTable(
         "camera",
@@ -203,6 +187,5 @@ def _print(rows: list[dict[str, str]], found: FoundRig, advice: list[str]) -> No
     for row in rows:
         table.add_row(*row.values())
     console.print(table)
-    print_plain(console, f"scale by {found.scale}")
-    for line in advice:
+    for line in lines:
         print_plain(console, line)

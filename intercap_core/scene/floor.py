@@ -35,6 +35,7 @@ from intercap_core.scene.up import (
     rough_up,
 )
 
+_TOES_AND_HEELS = slice(19, 25)
 AnnotatedFloor = Sequence[tuple[float, float, float]]  # points of the master's frame, metres
 
 
@@ -52,7 +53,6 @@ def floor_and_up(
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
-    toes_and_heels = slice(19, 25)
     if ground.found:
         off = FLOOR_DEG
         if floor is not None:
@@ -61,9 +61,7 @@ def floor_and_up(
         up = UpDirection(ground.normal, "floor", off)
     else:
         joints = triangulate_views(subject.keypoints, rig).joints
-        feet = joints[:, toes_and_heels]
-        up = _estimated_up(source, rig, joints, feet)
-        ground = fit_ground_to_feet(feet, up)
+        ground, up = floor_under_feet(rig, joints, source.gravity, source.stated_up)
         if np.isfinite(stated[1]).all():
             denied = ground.found and compare_with_stated(
                 ground.point, ground.normal, *stated, middle
@@ -73,27 +71,35 @@ def floor_and_up(
                 up = UpDirection(stated[0], "stated", STATED_DEG)
     notes = [ground.note]
     if ground.found and ground.source != "feet":
-        notes.append(describe_raised_feet(subject.joints[:, toes_and_heels], ground))
+        notes.append(describe_raised_feet(subject.joints[:, _TOES_AND_HEELS], ground))
     if ground.found:
         notes += compare_with_stated(ground.point, ground.normal, *stated, middle)
     return ground, up, list(filter(None, notes))
 
 
-def _estimated_up(source: Frames, rig: Rig, joints: np.ndarray, feet: np.ndarray) -> UpDirection:
-    """Up direction without a measured floor: as stated, or by all evidence together.
+def floor_under_feet(
+    rig: Rig, joints: np.ndarray, gravity: np.ndarray, stated_up: np.ndarray | None = None
+) -> tuple[GroundPlane, UpDirection]:
+    """Floor under the feet of a person, and up direction without a measured floor.
 
-    ``joints`` (T, K, 3) and ``feet`` (T, 6, 3) of the person in the master's frame; NaN = unknown.
+    The up direction is the stated one, else that of all evidence together.
+
+    Args:
+        joints: (T, K, 3) of the person, master frame, metres; NaN = unknown.
+        gravity: (C, 3) down in each colour camera; NaN = not measured.
+        stated_up: (3,) up in the master's frame; None or NaN = not stated.
     """
-    rough = rough_up(rig, source.gravity, source.stated_up)
-    if rough.source == "stated":
-        return rough
-    standing, _ = standing_on_floor(feet, rough.direction)
-    evidence = [
-        *camera_levels(rig, source.gravity),
-        *floor_levels(standing, FOOT_PLACE_M),
-        *balance_levels(joints),
-    ]
-    return estimate_up(rough, evidence)
+    feet = joints[:, _TOES_AND_HEELS]
+    up = rough_up(rig, gravity, stated_up)
+    if up.source != "stated":
+        standing, _ = standing_on_floor(feet, up.direction)
+        evidence = [
+            *camera_levels(rig, gravity),
+            *floor_levels(standing, FOOT_PLACE_M),
+            *balance_levels(joints),
+        ]
+        up = estimate_up(up, evidence)
+    return fit_ground_to_feet(feet, up), up
 
 
 def measured_floor(

@@ -219,7 +219,7 @@ def test_the_estimated_error_is_the_mean_displacement_of_sampled_poses() -> None
     covariance = np.zeros((2, 6, 2, 6))
     covariance[1, :, 1] = root @ root.T
     nothing = np.full(2, np.nan)
-    residuals = Residuals(nothing, nothing, [], np.zeros((0, 3)))
+    residuals = Residuals(nothing, nothing, [], np.zeros((0, 25, 3)))
     found = FoundRig(rig, covariance, residuals, *[nothing] * 3, "")
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3)  # their covariance
     cube = ring_centre(rig) + corners
@@ -237,7 +237,7 @@ def test_the_estimated_error_of_a_pair_is_that_between_two_cameras() -> None:
     covariance = np.zeros((3, 6, 3, 6))
     covariance[1:, :, 1:] = (root @ root.T).reshape(2, 6, 2, 6)
     nothing = np.full(3, np.nan)
-    residuals = Residuals(nothing, nothing, [], np.zeros((0, 3)))
+    residuals = Residuals(nothing, nothing, [], np.zeros((0, 25, 3)))
     found = FoundRig(rig, covariance, residuals, *[nothing] * 3, "")
     corners = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3)  # their covariance
     cube = ring_centre(rig) + corners

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from intercap_core.calibrate.advice import Advice
 from intercap_core.calibrate.found_rig import FoundRig
 from intercap_core.output.site import embed
 from intercap_core.output.site.capture_pictures import camera_colour
@@ -15,14 +16,20 @@ _LONG_M = 0.45  # length of a drawn camera's view
 
 
 def calibration_page(
-    name: str, found: FoundRig, up: np.ndarray, rows: list[dict[str, str]], advice: list[str]
+    name: str,
+    found: FoundRig,
+    up: np.ndarray,
+    rows: list[dict[str, str]],
+    advice: list[Advice],
+    floor: str,
 ) -> str:
     """HTML page of a calibration.
 
     Args:
         up: (3,) up direction, master frame.
         rows: table of the cameras.
-        advice: sentences on what to record for weak cameras.
+        advice: what to record for weak cameras; its places are marked in the pictures.
+        floor: sentence on the up direction and the floor.
     """
     pairs = [
         (
@@ -41,20 +48,24 @@ def calibration_page(
         {
             "name": name,
             "drawings": [
-                ("from above", _drawing(found, up, 0)),
-                ("from the side", _drawing(found, up, 1)),
+                ("from above", _drawing(found, up, 0, advice)),
+                ("from the side", _drawing(found, up, 1, advice)),
             ],
             "legend": [(n, camera_colour(c)) for c, n in enumerate(found.rig.names)],
             "scale": found.scale,
             "cameras": [list(row.values()) for row in rows],
             "pairs": pairs,
-            "advice": advice,
+            "advice": [item.text for item in advice],
+            "floor": floor,
         },
     )
 
 
-def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
-    """Shapes, px, of the cameras and the person's way, from above (0) or from the side (1)."""
+def _drawing(found: FoundRig, up: np.ndarray, side: int, advice: list[Advice]) -> dict[str, Any]:
+    """Shapes, px, of the cameras, the person's way and the advised places.
+
+    ``side``: from above (0) or from the side (1).
+    """
     ahead = found.rig.master_from_colour[0, :3, 2]
     ahead = ahead - (ahead @ up) * up
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
@@ -69,7 +80,9 @@ def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
         rays = lens.unproject(np.array([[0, 0], [u, 0], [u, v], [0, v]]))
         ends = pose[:3, 3] + _LONG_M * rays @ pose[:3, :3].T
         corners.append(np.concatenate([pose[None, :3, 3], ends]))
-    everything = np.concatenate([*corners, walk]) @ axes.T
+    marked = [item for item in advice if item.place is not None]
+    places = np.array([item.place for item in marked]).reshape(-1, 3)
+    everything = np.concatenate([*corners, walk, places]) @ axes.T
     low, high = everything.min(0), everything.max(0)
     margin = 30
     scale = min(
@@ -85,7 +98,13 @@ def _drawing(found: FoundRig, up: np.ndarray, side: int) -> dict[str, Any]:
         points = at(outline)
         sides = [_points(points[[0, 1 + k, 1 + (k + 1) % 4]]) for k in range(4)]
         cameras.append((found.rig.names[c], camera_colour(c), sides, points[0]))
-    return {"size": _SIZE, "way": _points(at(walk)), "cameras": cameras, "metre": scale}
+    return {
+        "size": _SIZE,
+        "way": _points(at(walk)),
+        "cameras": cameras,
+        "marks": [(item.camera, xy) for item, xy in zip(marked, at(places), strict=True)],
+        "metre": scale,
+    }
 
 
 def _points(places: np.ndarray) -> str:
