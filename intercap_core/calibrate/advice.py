@@ -50,8 +50,9 @@ def advise(found: FoundRig, ground: GroundPlane, up: np.ndarray) -> list[Advice]
             )
         )
     places = _floor_places(found, ground, up)
-    for c in np.flatnonzero(np.sqrt(np.maximum(sigma**2 - by_scale**2, 0)) > WEAK_M).tolist():
-        advice.append(_advise_camera(found, c, 1e3 * sigma[c], places, up))
+    apart = np.sqrt(np.maximum(sigma**2 - by_scale**2, 0))  # from the scale
+    for c in np.flatnonzero(apart > WEAK_M).tolist():
+        advice.append(_advise_camera(found, c, 1e3 * apart[c], places, up))
     return advice
 
 
@@ -81,7 +82,8 @@ def _advise_camera(
     found: FoundRig, c: int, sigma_mm: float, places: np.ndarray, up: np.ndarray
 ) -> Advice:
     name, names = found.rig.names[c], found.rig.names
-    known = f"{name} is known to {sigma_mm:.0f} mm only."
+    known = f"{name} is known to {sigma_mm:.0f} mm only"
+    known += ", without the error of the scale." if found.scale_sigma else "."
     shared = {pair.cameras: (pair.boards, pair.joints) for pair in found.residuals.pairs}
     for heights in (_BODY_HEIGHTS_M, (_BOARD_HEIGHT_M,)):
         points = places[:, None] + np.array(heights)[:, None] * up

@@ -39,7 +39,7 @@ from intercap_core.calibrate.placement import (
     reference_points,
 )
 from intercap_core.calibrate.refine import refine_on_surfaces
-from intercap_core.calibrate.scale import add_scale_sigma, check_board_size, rescale
+from intercap_core.calibrate.scale import add_scale_sigma, check_board_size, compare_scales, rescale
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.boards import Board
 from intercap_core.formats.detections.read import Detections, PeopleOfImages
@@ -114,6 +114,8 @@ def find_poses(
         check_agreement(found)
         terms = _terms(found.rig, views, board)
         background_m = _refine(found, opened[0], people[0], terms[1])
+        if metric:
+            compare_scales(found, views, distance, height_m)
         if distance is not None or not metric:
             rescale(found, views, distance, height_m)
         terms = _terms(found.rig, views, board)

@@ -29,6 +29,9 @@ UPRIGHT, BUILD_SIGMA = 0.97, 0.025
 HEIGHT_M, HEIGHT_SIGMA_M = 1.70, 0.095  # of adults of both sexes (NCD-RisC, eLife 2016), if unknown
 STATED_SIGMA_M = 0.02  # of a stated height, as in the table of subjects
 
+STATED_DISTANCE_M = 0.005  # standard deviation of a stated distance of two lenses
+METRIC_SIGMA = 0.01  # relative, of the scale by depth or a board: a millimetre of a square of 0.1 m
+
 SETS = 60  # of frames in which derivatives of the height are taken
 MAX_BOARD_FACTOR = 0.05  # by which a board's size may contradict the depth
 
@@ -86,7 +89,7 @@ def rescale(
         def length(poses: np.ndarray) -> float:
             return float(np.linalg.norm(poses[a, :3, 3] - poses[b, :3, 3]))
 
-        scale, sigma = distance[2] / length(rig.master_from_colour), 0.005 / distance[2]  # 5 mm
+        scale, sigma = distance[2] / length(rig.master_from_colour), STATED_DISTANCE_M / distance[2]
         found.scale = f"the stated distance between {distance[0]} and {distance[1]}"
     else:
         some = views.subset(np.unique(np.linspace(0, len(views.times) - 1, SETS).astype(int)))
@@ -145,6 +148,43 @@ def _by_scale(poses: np.ndarray) -> np.ndarray:
     steps = np.zeros((len(poses), 6))
     steps[:, 3:] = poses[:, :3, 3]
     return steps.ravel()
+
+
+def compare_scales(
+    found: FoundRig,
+    views: Views,
+    distance: tuple[str, str, float] | None,
+    height_m: float | None,
+) -> None:
+    """Compare the scale by depth or a board with a stated distance and a stated height.
+
+    Call it before :func:`rescale`. Contradictions become notes of ``found``. Raises UserError if
+    the height contradicts a board that alone gives the scale.
+    """
+    sources = []
+    if distance is not None:
+        a, b = (found.rig.names.index(name) for name in distance[:2])
+        poses = found.rig.master_from_colour
+        length = float(np.linalg.norm(poses[a, :3, 3] - poses[b, :3, 3]))
+        sigma = float(np.hypot(STATED_DISTANCE_M, found.pair_sigma_m(a, b))) / length
+        sources.append(("the stated distance", distance[2] / length, sigma))
+    if height_m is not None:
+        sources.append(("the subject's height", *_scale_by_height(found.rig, views, height_m)))
+    for name, ratio, sigma in sources:
+        most = 3 * float(np.hypot(sigma, METRIC_SIGMA))
+        if not abs(np.log(ratio)) > most:
+            continue
+        if found.scale == "board" and distance is None:
+            raise UserError(
+                f"by {name}, the board is {ratio:.2f} times as large as --board states, expected "
+                f"within {100 * most:.0f} %. Measure a square on the printed board and correct "
+                "--board, or correct the height in the table of subjects, or state the distance of "
+                "two cameras (--distance). Nothing was written"
+            )
+        found.notes.append(
+            f"by {name}, the rig is {ratio:.2f} times as large as by {found.scale}, expected "
+            f"within {100 * most:.0f} %: measure again what is wrong"
+        )
 
 
 def check_board_size(rig: Rig, views: Views, board: Board) -> None:

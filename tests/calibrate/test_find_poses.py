@@ -15,9 +15,12 @@ from intercap_core.calibrate import rig_poses
 from intercap_core.calibrate.evidence import NUM_JOINTS, Views
 from intercap_core.calibrate.found_rig import FoundRig
 from intercap_core.calibrate.placement import reference_points
+from intercap_core.calibrate.scale import scale_by_height
+from intercap_core.errors import UserError
+from intercap_core.formats.calibration.boards import parse_board
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from tests.calibrate.synthetic_views import views_of_walker
+from tests.calibrate.synthetic_views import board_poses_around, views_of_walker, with_board
 from tests.calibrate.test_background import ROOM
 from tests.helpers.synthetic_capture import (
     extrinsics_error,
@@ -29,6 +32,7 @@ from tests.helpers.synthetic_capture import (
 from tests.helpers.synthetic_people import write_detections
 
 SETS = 30
+BOARD = parse_board("checkerboard:3x4:0.1")
 TRUTH, UP = ring(4)
 _, JOINTS, VIEWS = views_of_walker(4, SETS, noise_px=4.0, depth=True, seed=417)
 
@@ -115,3 +119,35 @@ def test_estimated_errors_of_pairs_contain_errors_that_frames_share(
     found = find(tmp_path, rig, views, distance=("k1", "k3", baseline))
     ratios = error_over_estimate(found, rig, joints.mean((0, 1)))
     assert 0.2 < np.median(ratios) < 1.7 and ratios.max() < 3
+
+
+def views_with_board() -> tuple[Rig, np.ndarray, Views, float]:
+    """A person and a board of 12 places in one recording, and the height at which both agree."""
+    rig, joints, views = views_of_walker(4, 60, noise_px=2.0, seed=93)
+    poses = np.full((60, 4, 4), np.nan)
+    poses[::5] = board_poses_around(joints.mean((0, 1)), 12)
+    views = with_board(views, rig, BOARD, poses, noise_px=0.3)
+    return rig, joints, views, 1 / scale_by_height(joints, 1.0)[0]
+
+
+def test_person_and_board_together_give_poses_and_scale(tmp_path: Path) -> None:
+    rig, joints, views, height_m = views_with_board()
+    found = find(tmp_path, rig, views, board=BOARD, height_m=height_m)
+    assert found.scale == "board" and not found.notes
+    assert extrinsics_error(found.rig, rig, joints.mean((0, 1))).max() < 0.01
+    assert all(pair.boards > 5 and pair.corner_px < 1.5 for pair in found.residuals.pairs)
+    assert all(pair.joint_px < 4 for pair in found.residuals.pairs)
+
+
+def test_a_board_of_another_size_contradicts_the_height(tmp_path: Path) -> None:
+    rig, _, views, height_m = views_with_board()
+    larger = parse_board("checkerboard:3x4:0.125")
+    with pytest.raises(UserError, match=r"subject's height, the board is 0.8. times.*--board"):
+        find(tmp_path, rig, views, board=larger, height_m=height_m)
+
+
+def test_a_stated_distance_that_contradicts_the_board_is_noted(tmp_path: Path) -> None:
+    rig, _, views, _ = views_with_board()
+    baseline = float(np.linalg.norm(rig[2].master_from_colour[:3, 3]))
+    found = find(tmp_path, rig, views, board=BOARD, distance=("k1", "k3", 1.1 * baseline))
+    assert any("stated distance, the rig is 1.10 times" in note for note in found.notes)
