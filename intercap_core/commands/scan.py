@@ -348,7 +348,7 @@ def _ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = N
 def add_entry(
     project: Project, name: str, labels: Sequence[str], mesh: ScannedMesh, path: Path
 ) -> None:
-    """Append the object to objects.yaml, or print its entry if the file has one."""
+    """Append the object to objects.yaml, or print its entry if it cannot be appended."""
     file = project.path.parent / project.config.objects
     symmetry = mesh.symmetry.symmetry.model_dump(mode="json", exclude_defaults=True)
     content: dict[str, object] = {"mesh": os.path.relpath(path, file.parent)}
@@ -362,6 +362,25 @@ def add_entry(
             standard_console(), f"{file} has an entry {name!r}; of this mesh it is:\n{text}"
         )
         return
-    before = file.read_text(encoding="utf-8")
-    file.write_text(before + "\n" * (not before.endswith("\n")) + text, encoding="utf-8")
+    after = _appended(file.read_text(encoding="utf-8"), text)
+    if after is None:
+        print_plain(
+            standard_console(),
+            f"{file} is not a block mapping, so that nothing was added; add this entry:\n{text}",
+        )
+        return
+    file.write_text(after, encoding="utf-8")
     print_plain(standard_console(), f"added to {file}:\n{text}")
+
+
+def _appended(before: str, entry: str) -> str | None:
+    """The text of a YAML mapping with one more entry; None if appending lines does not add it."""
+    known = yaml.safe_load(before) or {}
+    if not known:  # {} or comments alone
+        before = "".join(line for line in before.splitlines(True) if line.startswith("#"))
+    after = before + "\n" * (bool(before) and not before.endswith("\n")) + entry
+    try:
+        added = yaml.safe_load(after) == known | yaml.safe_load(entry)
+    except yaml.YAMLError:
+        return None
+    return after if added else None

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from intercap_core.commands.scan import add_entry, scan
+from intercap_core.commands.scan import _appended, add_entry, scan
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 from intercap_core.scan.proposal import propose_symmetry
@@ -75,6 +75,20 @@ def test_a_new_object_is_added_to_the_users_file(project: Project) -> None:
     before = file.read_text()
     add_entry(load_project(project.path), "kettle", [], mesh, path)  # the user's entry stays
     assert file.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("", "kettle: {mesh: k.ply}\n"),
+        ("# none yet\n{}\n", "# none yet\nkettle: {mesh: k.ply}\n"),
+        ("cup: {mesh: c.ply}", "cup: {mesh: c.ply}\nkettle: {mesh: k.ply}\n"),
+        ("{cup: {mesh: c.ply}}\n", None),
+        ("  cup: {mesh: c.ply}\n", None),
+    ],
+)
+def test_an_entry_is_appended_only_if_the_file_stays_valid(before: str, after: str | None) -> None:
+    assert _appended(before, "kettle: {mesh: k.ply}\n") == after
 
 
 @pytest.fixture(scope="module")
