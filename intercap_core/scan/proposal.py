@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,14 +60,13 @@ def propose_symmetry(vertices: np.ndarray, faces: np.ndarray) -> ProposedSymmetr
     points = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0]
     field = DistanceField(vertices, faces)
 
-    def distance(axis: np.ndarray, angles: np.ndarray) -> float:
-        """Largest of the distances that most of the surface keeps, over some angles."""
-        turned = [points @ rotation_exp(angle * axis).T for angle in angles]
-        return max(float(np.quantile(field.distance(p), ALIKE_SHARE)) for p in turned)
+    def distance(rotation: np.ndarray) -> float:
+        """Distance within which most of the turned surface is, metres."""
+        return float(np.quantile(field.distance(points @ rotation.T), ALIKE_SHARE))
 
     axes = np.eye(3)[[2, 0, 1]]
     turns = np.radians(np.arange(15.0, 360.0, 30.0))
-    around = [distance(axis, turns) for axis in axes]
+    around = [max(distance(rotation_exp(turn * axis)) for turn in turns) for axis in axes]
     if max(around) < ALIKE_M:
         return ProposedSymmetry(Symmetry(sphere=True), f"sphere, {_mm(max(around))}")
     if min(around) < ALIKE_M:
@@ -76,25 +74,25 @@ def propose_symmetry(vertices: np.ndarray, faces: np.ndarray) -> ProposedSymmetr
         axis = tuple(axes[best].tolist())
         symmetry = Symmetry(continuous=(ContinuousSymmetry(axis=axis),))
         return ProposedSymmetry(symmetry, f"all turns about {'zxy'[best]}, {_mm(around[best])}")
-    found = list(_discrete(axes, distance))
-    matrices = tuple(tuple(matrix.ravel().round(6).tolist()) for matrix, _ in found)
-    words = "; ".join(text for _, text in found) or "none"
-    return ProposedSymmetry(Symmetry(discrete=matrices), words)
-
-
-def _discrete(
-    axes: np.ndarray, distance: Callable[[np.ndarray, np.ndarray], float]
-) -> Iterator[tuple[np.ndarray, str]]:
-    """Turns of the highest order about each axis, and words on them."""
+    turns_found, nearest = [], (np.inf, "")
     for axis, name in zip(axes, "zxy", strict=True):
         for order in reversed(ORDERS):
-            angle = 2 * np.pi / order
-            off = distance(axis, np.array([angle]))
+            rotation = rotation_exp(2 * np.pi / order * axis)
+            off = distance(rotation)
+            text = f"{order} turns about {name}, {_mm(off)}"
+            nearest = min(nearest, (off, text))
             if off < ALIKE_M:
-                matrix = np.eye(4)
-                matrix[:3, :3] = rotation_exp(angle * axis)
-                yield matrix, f"{order} turns about {name}, {_mm(off)}"
+                turns_found.append((rotation, text))
                 break
+    if not turns_found:
+        return ProposedSymmetry(Symmetry(), f"none; the nearest is {nearest[1]}")
+    matrices = []
+    for rotation, _ in turns_found:
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation
+        matrices.append(tuple(matrix.ravel().round(6).tolist()))
+    words = "; ".join(text for _, text in turns_found)
+    return ProposedSymmetry(Symmetry(discrete=tuple(matrices)), words)
 
 
 def _mm(metres: float) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from intercap_core.entries import Symmetry
 from intercap_core.geometry.camera.transforms import apply, rigid, rotation_exp
 from intercap_core.scan.proposal import propose_symmetry, standing_frame
 
@@ -50,8 +51,9 @@ def test_a_handle_breaks_the_symmetry() -> None:
     handle = trimesh.creation.box((0.04, 0.015, 0.06))
     handle.apply_translation((0.06, 0, 0))
     vertices, faces = in_frame(trimesh.util.concatenate([body, handle]))
-    found = propose_symmetry(vertices, faces).symmetry
-    assert not found.continuous and not found.sphere
+    found = propose_symmetry(vertices, faces)
+    assert found.symmetry == Symmetry()
+    assert "none; the nearest is 2 turns about" in found.words
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0])
