@@ -49,7 +49,7 @@ def test_a_ball_is_a_sphere() -> None:
 def test_a_handle_breaks_the_symmetry() -> None:
     body = trimesh.creation.cylinder(0.04, 0.1, sections=64)
     handle = trimesh.creation.box((0.04, 0.015, 0.06))
-    handle.apply_translation((0.06, 0, 0))
+    handle.apply_translation((0.06, 0, 0.015))
     vertices, faces = in_frame(trimesh.util.concatenate([body, handle]))
     found = propose_symmetry(vertices, faces)
     assert found.symmetry == Symmetry()
