@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -43,15 +44,13 @@ def scale_by_height(joints: np.ndarray, height_m: float | None) -> tuple[float, 
     median over the segments of the limbs, and the distance of the shoulders from the ankles.
     ``height_m`` None = unknown. NaN if no segment is known.
     """
-    body = load_body_file(None, num_betas=0, num_expression=0)
-    rest = body.joint_regressor @ body.template
-    stature = float(np.ptp(body.template[:, 1]))
+    rest = _open_body_joints()
 
     def found(name: str) -> np.ndarray:
         return joints[:, KEYPOINT_INDEX[name]]
 
     def expected(name: str) -> np.ndarray:
-        return rest[JOINT_INDEX[name]] / stature
+        return rest[JOINT_INDEX[name]]
 
     ratios = []
     for a, b in _SEGMENTS:
@@ -73,6 +72,15 @@ def scale_by_height(joints: np.ndarray, height_m: float | None) -> tuple[float, 
     sigma = STATED_SIGMA_M if height_m else HEIGHT_SIGMA_M
     scale = float(np.mean(ways)) * height if ways else float("nan")
     return scale, float(np.hypot(BUILD_SIGMA, sigma / height))
+
+
+@cache  # a derivative of the scale needs many estimates
+def _open_body_joints() -> np.ndarray:
+    """Rest joints (J, 3) of the open body, in units of its stature."""
+    body = load_body_file(None, num_betas=0, num_expression=0)
+    joints = body.joint_regressor @ body.template / np.ptp(body.template[:, 1])
+    joints.setflags(write=False)
+    return joints
 
 
 def rescale(
