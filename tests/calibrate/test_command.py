@@ -56,6 +56,12 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> PlainProject:
 
 
 @pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> PlainProject:
+    """A person who walks for two seconds. Tests write their results elsewhere."""
+    return write_walk(tmp_path_factory.mktemp("short"), TRUTH, UP, sets=30)
+
+
+@pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> PlainProject:
     """A board before two neighbours of a ring of six, which see it at the same time."""
     folder = tmp_path_factory.mktemp("board")
@@ -75,8 +81,8 @@ def test_poses_follow_from_a_walk(walk: PlainProject, tmp_path: Path) -> None:
         assert written.available.all()
 
 
-def test_the_height_of_the_subject_gives_the_scale(walk: PlainProject, tmp_path: Path) -> None:
-    path, _ = run(walk, output=tmp_path / "rig.json")
+def test_the_height_of_the_subject_gives_the_scale(short: PlainProject, tmp_path: Path) -> None:
+    path, _ = run(short, output=tmp_path / "rig.json")
     found = read_calibration(path).extrinsics.master_from_colour["k2"][:3, 3]
     ratio = np.linalg.norm(found) / np.linalg.norm(TRUTH.master_from_colour[1, :3, 3])
     assert abs(ratio - 1) < 0.12  # a stick person of 1.7 m
@@ -147,7 +153,7 @@ def test_layouts_with_poses_are_refused(walk: PlainProject, tmp_path: Path, layo
 
 
 def walking_people() -> np.ndarray:
-    return seen_by(walker(np.arange(60) / FPS), TRUTH, UP)
+    return seen_by(walker(np.arange(30) / FPS), TRUTH, UP)
 
 
 def still(people: np.ndarray) -> np.ndarray:
@@ -155,7 +161,7 @@ def still(people: np.ndarray) -> np.ndarray:
 
 
 def without_common_view(people: np.ndarray) -> np.ndarray:
-    people[:30, 0], people[30:, 1:] = np.nan, np.nan
+    people[:15, 0], people[15:, 1:] = np.nan, np.nan
     return people
 
 
@@ -179,9 +185,8 @@ def test_walks_that_do_not_determine_the_poses_are_refused(
     refuse(write_walk(tmp_path, TRUTH, UP, sets=len(people), people=people), *words)
 
 
-def test_a_short_walk_gives_poses_and_a_note(tmp_path: Path) -> None:
-    project = write_walk(tmp_path, TRUTH, UP, sets=30)
-    path, page = run(project, output=tmp_path / "out.json", distance=distance())
+def test_a_short_walk_gives_poses_and_a_note(short: PlainProject, tmp_path: Path) -> None:
+    path, page = run(short, output=tmp_path / "out.json", distance=distance())
     assert errors_m(path).max() < 0.05
     assert "together for only 1.9 s" in page.read_text()
 
@@ -193,7 +198,7 @@ def test_exchanged_sides_in_one_camera_do_not_lead_astray(tmp_path: Path) -> Non
     people = walking_people()
     people[:, 2] = swap_sides(people[:, 2])
     assert np.isfinite(people[:, :, BODY]).all()
-    project = write_walk(tmp_path, TRUTH, UP, people=people)
+    project = write_walk(tmp_path, TRUTH, UP, sets=len(people), people=people)
     try:
         path, _ = run(project, output=tmp_path / "out.json", distance=distance())
     except UserError as error:
