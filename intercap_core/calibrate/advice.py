@@ -81,6 +81,15 @@ def _sees(camera: Camera, points: np.ndarray) -> np.ndarray:
 def _advise_camera(
     found: FoundRig, c: int, sigma_mm: float, places: np.ndarray, up: np.ndarray
 ) -> Advice:
+    """Instruct to walk, or else to hold a board, where camera c and another one see.
+
+    The other one is the camera with which it shares the least evidence.
+
+    Args:
+        sigma_mm: standard deviation of the camera, without that of the scale.
+        places: (N, 3) candidates on the floor, master frame, metres.
+        up: (3,) up direction, master frame.
+    """
     name, names = found.rig.names[c], found.rig.names
     known = f"{name} is known to {sigma_mm:.0f} mm only"
     known += ", without the error of the scale." if found.scale_sigma else "."

@@ -25,6 +25,7 @@ MAX_GRAVITY_DEG = 5.0  # between gravity sensors; one of a Kinect is within a de
 
 
 def require_images(opened: Sequence[Frames]) -> None:
+    """Raise UserError unless all recordings have the same cameras and each has an image."""
     names = opened[0].rig.names
     for frames in opened:
         if frames.rig.names != names:

@@ -114,8 +114,8 @@ def fuse(
 def place_variance(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Quadratic form Q (4, 4) of the variance of the object's points under an uncertain pose.
 
-    (x, 1) Q (x, 1)' is the variance of the point x, averaged over the three directions, square
-    metres.
+    (x, 1) Q (x, 1)' is the variance in square metres, averaged over the three directions, of the
+    point x of the object's frame.
 
     Args:
         pose: (4, 4) master_from_object.

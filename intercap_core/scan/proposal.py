@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from intercap_core.entries import ContinuousSymmetry, Symmetry
-from intercap_core.geometry.camera.transforms import rotation_exp
+from intercap_core.geometry.camera.transforms import rigid, rotation_exp
 from intercap_core.geometry.rigid.distance import DistanceField
 
 ALIKE_M = 0.003  # surfaces this near to each other are equal; error of a scan
@@ -86,13 +86,9 @@ def propose_symmetry(vertices: np.ndarray, faces: np.ndarray) -> ProposedSymmetr
                 break
     if not turns_found:
         return ProposedSymmetry(Symmetry(), f"none; the nearest is {nearest[1]}")
-    matrices = []
-    for rotation, _ in turns_found:
-        matrix = np.eye(4)
-        matrix[:3, :3] = rotation
-        matrices.append(tuple(matrix.ravel().round(6).tolist()))
-    words = "; ".join(text for _, text in turns_found)
-    return ProposedSymmetry(Symmetry(discrete=tuple(matrices)), words)
+    matrices = [rigid(rotation, np.zeros(3)).ravel().round(6) for rotation, _ in turns_found]
+    symmetry = Symmetry(discrete=tuple(tuple(matrix.tolist()) for matrix in matrices))
+    return ProposedSymmetry(symmetry, "; ".join(text for _, text in turns_found))
 
 
 def _mm(metres: float) -> str:
